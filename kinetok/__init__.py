@@ -1,0 +1,3 @@
+"""kinetok: the motion of physically simulated characters, as tokens."""
+
+__version__ = "0.1.0"

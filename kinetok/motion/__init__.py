@@ -1,0 +1,1 @@
+"""Who moves and what is moved: characters, clips, libraries of clips, kinematics and file formats."""

@@ -1,0 +1,71 @@
+"""Presets: plain functions of no arguments that return a whole configuration. `tiny` runs any stage in seconds.
+
+    config = pick(FIT, "one-clip", "preset")()
+
+Any leaf is then changed by `--set key=value`.
+"""
+
+from kinetok.rl.ppo import PPOConfig
+from kinetok.sim.env import EnvConfig
+from kinetok.tokenizers.distill import DistillStage
+from kinetok.tokenizers.fit import FitConfig
+from kinetok.tokenizers.fsq import FSQConfig
+from kinetok.tokenizers.quantizer import ContinuousConfig
+from kinetok.tokenizers.tokenizer import TokenizerConfig
+from kinetok.tokenizers.train import PPOStage
+
+
+def one_clip() -> FitConfig:
+    """One motion in minutes on two cores: a small teacher, a small student, no polishing."""
+    return FitConfig(stages=("teacher", "distill"))
+
+
+def many_clips() -> FitConfig:
+    """Dozens of motions in hours on two cores: an expert per clip, robust to pushes, and a wider student."""
+    return FitConfig(
+        tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=30, levels=9), encoder=(512, 256), decoder=(512, 256)),
+        teacher=PPOStage(
+            samples=3_000_000,
+            stop_success=1.0,
+            stop_mpjpe_mm=35.0,
+            env=EnvConfig(reset_noise=0.02, push=1.0),
+        ),
+        distill=DistillStage(samples=1_500_000, rows=512, minibatch=2048, memory=262_144, eval_every=150_000,
+                             eval_episodes=4, env=EnvConfig(reset_noise=0.02, push=1.0)),
+    )  # fmt: skip
+
+
+def from_scratch() -> FitConfig:
+    """The paper's form: end-to-end PPO through the bottleneck from random weights, nothing else."""
+    return FitConfig(
+        stages=("ppo",),
+        ppo=PPOStage(samples=8_000_000, ppo=PPOConfig(log_std=(-2.3, -2.9)), stop_success=1.0, stop_mpjpe_mm=40.0),
+    )
+
+
+def tiny() -> FitConfig:
+    """Seconds, for tests: nothing it makes can walk."""
+    small = TokenizerConfig(quantizer=FSQConfig(dim=6, levels=5), encoder=(32,), decoder=(32,), future=(1, 2, 5))
+    teacher = TokenizerConfig(
+        quantizer=ContinuousConfig(dim=16),
+        future=(1,),
+        encoder=(32,),
+        decoder=(),
+        encoder_inputs=("window", "error"),
+        decoder_inputs=(),
+        residual=True,
+    )
+    stage = PPOStage(
+        samples=1024, rows=32, eval_every=512, eval_episodes=2, critic=(32,), ppo=PPOConfig(horizon=8, minibatch=128)
+    )
+    return FitConfig(
+        tokenizer=small,
+        teacher_tokenizer=teacher,
+        teacher=stage,
+        distill=DistillStage(samples=640, rows=32, minibatch=64, memory=512, eval_every=320, eval_episodes=2),
+        ppo=stage,
+        workers=1,
+    )
+
+
+FIT = {"one-clip": one_clip, "many-clips": many_clips, "from-scratch": from_scratch, "tiny": tiny}

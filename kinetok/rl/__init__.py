@@ -1,0 +1,1 @@
+"""Learning from reward: rollouts, advantages, PPO. It knows neither MuJoCo nor motion."""

@@ -1,0 +1,163 @@
+"""Tracking: follow a reference clip. GPC's observations, reward and termination (app. B).
+
+    table = ReferenceTable(library, control_hz=30, seconds=20)
+    task = Tracking(TrackingConfig(), table, rows=512)
+
+The observation of a row is state | window | error | target (see `layout`): proprioception, the future frames
+relative to the body, the tracking error now, and the PD target that the next reference frame suggests. Which
+parts a policy reads is the policy's choice: a tokenizer's encoder reads the window, its decoder the state, a
+teacher may read all. Clips are tabulated once at the control rate, loops unrolled to the longest episode.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kinetok import rotation
+from kinetok.motion.character import Character
+from kinetok.motion.kinematics import kinematics
+from kinetok.motion.library import ClipLibrary
+from kinetok.sim import observe
+from kinetok.sim.batch import BodyState
+from kinetok.sim.reset import ClipWeights
+from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingConfig:
+    """future: reference frames seen, in control steps ahead (GPC: 1, 2, 5, 7, 12, 18, 25); fail_max, fail_mean:
+    an episode fails when the largest or the mean body error exceeds so many metres."""
+
+    future: tuple[int, ...] = (1, 2, 5, 7, 12, 18, 25)
+    fail_max: float = 0.5
+    fail_mean: float = 0.3
+    reward: TrackingReward = TrackingReward()
+
+
+class ReferenceTable:
+    """Clips as arrays over frames at the control rate (float32); frames of clip k are first[k] .. last[k]."""
+
+    def __init__(self, library: ClipLibrary, *, control_hz: int = 30, seconds: float = 20.0):
+        self.character = Character.load(library.character)
+        self.names, self.control_hz = library.names, control_hz
+        motions, counts, self.cycle = [], [], np.empty(len(library), dtype=int)
+        for index in range(len(library)):
+            clip = library.clip(index)
+            self.cycle[index] = max(int(clip.seconds * control_hz + 1e-6), 1)
+            span = self.cycle[index] + (round(seconds * control_hz) if clip.loop else 0)
+            times = np.arange(span + 1) / control_hz
+            motions.append(kinematics(self.character, clip.at(times), control_hz))
+            counts.append(span + 1)
+        self.first = np.cumsum(counts) - counts
+        self.last = self.first + counts - 1
+        self.qpos = np.concatenate([m.qpos for m in motions])
+        self.qvel = np.concatenate([m.qvel for m in motions])
+        quat = np.concatenate([m.xquat for m in motions])
+        self.body = BodyState(
+            pos=np.concatenate([m.xpos for m in motions]).astype(np.float32),
+            mat=rotation.to_matrix(quat).astype(np.float32),
+            linear=np.concatenate([m.linear for m in motions]).astype(np.float32),
+            angular=np.concatenate([m.angular for m in motions]).astype(np.float32),
+            quat=quat[:, 0].astype(np.float32),
+        )
+        self.heading = rotation.heading(self.body.quat)
+        self.pose = observe.pose_features(self.body.pos, self.body.mat, self.body.quat)
+        self.root = np.ascontiguousarray(self.body.pos[:, 0])
+        body = self.character
+        # PD target that makes a joint with damping kd follow a moving reference: q + kd / kp * qd
+        ctrl = body.pose_to_ctrl(self.qpos) + body.kd / body.kp * self.qvel[:, body.dof]
+        self.target = ctrl.astype(np.float32)
+
+
+class Tracking:
+    """The tracking task of `rows` worlds.
+
+    Episodes start anywhere in a clip (reference-state initialisation), clips drawn by how often they fail. `fixed`
+    (rows,) pins each row to one clip and `starts` (rows,) to one frame of it, counted from its first.
+    """
+
+    def __init__(
+        self,
+        config: TrackingConfig,
+        table: ReferenceTable,
+        *,
+        rows: int,
+        fixed: np.ndarray | None = None,
+        starts: np.ndarray | None = None,
+    ):
+        self.config, self.table, self.character = config, table, table.character
+        self.weights = ClipWeights(len(table.names))
+        self.fixed, self.starts = fixed, starts
+        self.clip = np.zeros(rows, dtype=int)
+        self.frame = np.zeros(rows, dtype=int)
+        self.error = np.zeros((rows, len(self.character.body_names)), dtype=np.float32)
+        self._future = np.array(config.future)
+        bodies = len(self.character.body_names)
+        sizes = {
+            "state": observe.state_size(bodies),
+            "window": observe.window_size(bodies, len(config.future)),
+            "error": observe.error_size(bodies),
+            "target": self.character.nu,
+        }
+        edges = np.cumsum([0, *sizes.values()])
+        self.layout = {name: slice(int(a), int(b)) for name, a, b in zip(sizes, edges, edges[1:], strict=False)}
+        self.obs_size = int(edges[-1])
+
+    def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Poses and velocities of the frames at which rows ids begin."""
+        table = self.table
+        if self.fixed is not None:
+            clip = self.fixed[ids]
+        else:
+            edges = np.cumsum(self.weights.values)
+            clip = np.searchsorted(edges, rng.random(len(ids)) * edges[-1], side="right").clip(max=len(edges) - 1)
+        if self.starts is not None:
+            offset = self.starts[ids]
+        else:
+            offset = (rng.random(len(ids)) * table.cycle[clip]).astype(int)
+        self.clip[ids] = clip
+        self.frame[ids] = table.first[clip] + offset
+        return table.qpos[self.frame[ids]], table.qvel[self.frame[ids]]
+
+    def advance(self) -> None:
+        """Time goes on by one control step."""
+        self.frame = np.minimum(self.frame + 1, self.table.last[self.clip])
+
+    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
+        """state | window | error | target (n, O) float32 of all rows or of rows ids."""
+        table = self.table
+        frame, last = self.frame, table.last[self.clip]
+        if ids is not None:
+            frame, last = frame[ids], last[ids]
+        ahead = np.minimum(frame[:, None] + self._future, last[:, None])
+        parts = [
+            observe.state_features(body),
+            observe.window_features(body, table.pose[ahead], table.root[ahead], table.heading[ahead]),
+            observe.error_features(body, table.body.rows(frame)),
+            table.target[np.minimum(frame + 1, last)],
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """GPC eq. 8 against the frame the row should have reached."""
+        terms = tracking_reward(tracking_errors(body, self.table.body.rows(self.frame)), self.config.reward)
+        return np.sum(list(terms.values()), axis=0), terms
+
+    def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
+        """terminated: the error is too large (or not a number); truncated: the clip is over.
+
+        `error` keeps every body's distance (N, B) in metres from the reference, as it was before any reset.
+        """
+        self.error = np.sqrt(((body.pos - self.table.body.pos[self.frame]) ** 2).sum(-1))
+        fine = (self.error.max(1) < self.config.fail_max) & (self.error.mean(1) < self.config.fail_mean)
+        return ~fine, self.frame >= self.table.last[self.clip]
+
+    def state_dict(self) -> dict:
+        return {"weights": self.weights.values.tolist()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.weights.values = np.array(state["weights"])
+
+    def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
+        """Failure-weighted clip sampling learns from every finished episode."""
+        self.weights.update(self.clip[ids], ~terminated)

@@ -1,0 +1,184 @@
+"""Online distillation: the student acts, the teacher labels (DAgger, Ross et al. 2011; Hybrid sec. 4).
+
+    score = distill(student, teachers, table, DistillStage(), out, seed=0)
+
+The student (a tokenizer with its bottleneck) drives the worlds, so the states are the ones it will meet; each
+state is labelled with the PD targets of its clip's teacher, and the student regresses on a window of the latest
+labelled states. One student may learn from many teachers: `teachers[k]` labels clip k. Pushes, noisy starts and
+episodes that end early keep the states as varied as the teachers can handle.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
+from kinetok.config import diff, to_dict
+from kinetok.logger import Logger
+from kinetok.rl.rollout import torch_threads
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.track import TrackingScore, track
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillStage:
+    """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
+    memory: labelled states kept; noise: radians added to the student's targets while it acts."""
+
+    samples: int = 200_000
+    rows: int = 256
+    updates: int = 2
+    minibatch: int = 1024
+    memory: int = 131_072
+    lr: float = 1e-3
+    lr_end: float = 1e-4
+    noise: float = 0.02
+    fail_mean: float = 0.3
+    eval_every: int = 50_000
+    eval_episodes: int = 16
+    env: EnvConfig = EnvConfig(reset_noise=0.01)
+
+
+def distill(
+    student: MotionTokenizer,
+    teachers: Sequence[MotionTokenizer],
+    table: ReferenceTable,
+    config: DistillStage,
+    out: Path,
+    *,
+    seed: int = 0,
+    threads: int = 0,
+    card: Callable[[TrackingScore], str] = lambda score: "",
+    parents: dict[str, str] | None = None,
+    quiet: bool = False,
+) -> TrackingScore:
+    """Train `student` in place; returns the score of the best artifact, which lies in `out`."""
+    if len(teachers) != len(table.names):
+        raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
+    future, scene = student.config.future, student.config.scene
+    task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
+    env = Env(config.env, task, rows=config.rows, threads=threads, seed=seed)
+    views = [_View(teacher, task) for teacher in teachers]
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
+    identity = {
+        "stage": to_dict(config),
+        "tokenizer": to_dict(student.config),
+        "seed": seed,
+        "clips": list(table.names),
+    }
+    path = out / "state.safetensors"
+    step = evaluated = 0
+    best_merit, best = -1e9, None
+    memory = torch.empty(config.memory, env.obs_size)
+    labels = torch.empty(config.memory, env.action_size)
+    if path.exists():
+        tensors, meta = load_state(path)
+        changed = diff(meta["identity"], identity)
+        if changed:
+            raise CheckpointError(
+                f"{path}: started with another configuration: {'; '.join(changed)}; choose another --out"
+            )
+        tree = unflatten(tensors, meta["tree"])
+        student.load_state_dict(tree["student"])
+        optimizer.load_state_dict(tree["optimizer"])
+        generator.set_state(tree["generator"])
+        env.load_state_dict(json.loads(meta["env"]))
+        step, best_merit = meta["step"], meta["best"]
+        evaluated = step * config.rows
+    # The memory is filled anew after every save, so that a resumed run and an unbroken one are the same.
+    filled = cursor = 0
+    total = config.samples // config.rows
+    with Logger(out, total=config.samples, title="distill", start=step * config.rows, quiet=quiet) as log:
+        obs = torch.from_numpy(env.reset(spread=True))
+        while step < total:
+            with torch.no_grad(), torch_threads(1):
+                action = student.act(obs)[0]
+                target = _label(views, obs, task)
+                rows = torch.arange(cursor, cursor + config.rows) % config.memory
+                memory[rows], labels[rows] = obs, target
+                cursor, filled = cursor + config.rows, min(filled + config.rows, config.memory)
+                if float(student.norm.count) < 1_000_000:
+                    student.observe(obs)
+                action += config.noise * torch.randn(action.shape, generator=generator)
+                obs = torch.from_numpy(env.step(action.numpy()).obs)
+            for group in optimizer.param_groups:
+                group["lr"] = config.lr + (config.lr_end - config.lr) * step / total
+            loss = torch.zeros(())
+            for _ in range(config.updates):
+                ids = torch.randint(filled, (config.minibatch,), generator=generator)
+                loss = _regress(student, optimizer, memory[ids], labels[ids])
+            step += 1
+            samples = step * config.rows
+            metrics = {"label_rmse": float(loss) ** 0.5} if step % 20 == 0 else {}
+            if samples - evaluated >= config.eval_every or step == total:
+                evaluated = samples
+                score = track(
+                    student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
+                )
+                metrics |= {f"track/{k}": v for k, v in score.summary().items()} | env.episode_metrics()
+                if score.merit > best_merit:
+                    best_merit, best = score.merit, score
+                    student.save_pretrained(out, card(score), parents)
+                tensors, skeleton = flatten(
+                    {
+                        "student": dict(student.state_dict()),
+                        "optimizer": optimizer.state_dict(),
+                        "generator": generator.get_state(),
+                    }
+                )
+                meta = {"tree": skeleton, "identity": identity, "step": step, "best": best_merit}
+                save_state(path, tensors, meta | {"env": json.dumps(env.state_dict())})
+                obs = torch.from_numpy(env.reset(spread=True))
+                filled = cursor = 0
+            if metrics:
+                log.write(samples, metrics)
+    student.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())
+    return best or track(student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
+
+
+class _View:
+    """A teacher with its own future window, seen through the student's observations.
+
+    The teacher's window frames must be among the student's; its observation is a selection of columns.
+    """
+
+    def __init__(self, teacher: MotionTokenizer, task: Tracking):
+        missing = set(teacher.config.future) - set(task.config.future)
+        if missing:
+            raise ValueError(f"teacher looks {sorted(missing)} steps ahead, the student only {task.config.future}")
+        window, count = task.layout["window"], len(task.config.future)
+        columns = torch.arange(window.start, window.stop).view(count, -1)
+        picked = columns[[task.config.future.index(f) for f in teacher.config.future]].flatten()
+        before, after = torch.arange(window.start), torch.arange(window.stop, task.obs_size)
+        self.teacher, self.columns = teacher.eval(), torch.cat([before, picked, after])
+
+    def act(self, obs: Tensor) -> Tensor:
+        return self.teacher.act(obs[:, self.columns])[0]
+
+
+def _label(views: list[_View], obs: Tensor, task: Tracking) -> Tensor:
+    target = torch.empty(len(obs), task.character.nu)
+    clip = torch.from_numpy(task.clip)
+    for index, view in enumerate(views):
+        ids = torch.nonzero(clip == index).flatten()
+        if len(ids):
+            target[ids] = view.act(obs[ids])
+    return target
+
+
+def _regress(student: MotionTokenizer, optimizer: torch.optim.Optimizer, obs: Tensor, target: Tensor) -> Tensor:
+    mean, auxiliary, _ = student.act(obs)
+    loss = (mean - target).pow(2).mean()
+    if not torch.isfinite(loss):
+        raise FloatingPointError(f"distillation loss is {loss.item()}; the last good state is kept")
+    optimizer.zero_grad(set_to_none=True)
+    (loss + auxiliary).backward()
+    optimizer.step()
+    return loss.detach()

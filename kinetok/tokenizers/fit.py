@@ -1,0 +1,235 @@
+"""Fit a tokenizer in three stages, each also a function of its own and each resumable.
+
+    fit(clips, FitConfig(), Path("runs/walk"), seed=0)
+
+1. teacher    one continuous expert per clip, by PPO around the reference      out/teachers/NAME
+2. distill    one student with the bottleneck learns from all of them online   out/distill
+3. ppo        the student goes on end to end through the bottleneck            out/ppo
+
+`stages=("ppo",)` trains end to end from nothing, the paper's form. The artifact in `out` itself is the best of
+the student stages by the same evaluation, and its card says which stages made it. Teachers are independent, so
+they train side by side, one core each; the result does not depend on how many do.
+"""
+
+import multiprocessing
+import shutil
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from kinetok.checkpoint import load_artifact
+from kinetok.config import ConfigError, nearest, to_dict
+from kinetok.motion.clip import Clip
+from kinetok.motion.library import ClipLibrary
+from kinetok.rl.ppo import PPOConfig
+from kinetok.sim.env import EnvConfig
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.distill import DistillStage, distill
+from kinetok.tokenizers.quantizer import ContinuousConfig
+from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
+from kinetok.tokenizers.track import TrackingScore
+from kinetok.tokenizers.train import PPOStage, train_ppo
+
+STAGES = ("teacher", "distill", "ppo")
+
+
+def _teacher_tokenizer() -> TokenizerConfig:
+    return TokenizerConfig(
+        quantizer=ContinuousConfig(dim=128),
+        future=(1, 2),
+        encoder=(256,),
+        decoder=(),
+        encoder_inputs=("window", "error"),
+        decoder_inputs=(),
+        residual=True,
+    )
+
+
+def _polish() -> PPOStage:
+    return PPOStage(
+        samples=1_000_000,
+        critic_warmup=10,
+        env=EnvConfig(reset_noise=0.02, push=0.5),
+        ppo=PPOConfig(log_std=(-3.2, -3.2), lr=5e-5, lr_max=2e-4, target_kl=0.01, anchor=0.02),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """stages; tokenizer: the student; teacher_tokenizer: its experts; the three stages' own settings; workers:
+    teachers that train at once."""
+
+    stages: tuple[str, ...] = STAGES
+    tokenizer: TokenizerConfig = TokenizerConfig()
+    teacher_tokenizer: TokenizerConfig = field(default_factory=_teacher_tokenizer)
+    teacher: PPOStage = PPOStage(env=EnvConfig(reset_noise=0.02, push=0.5), stop_success=1.0, stop_mpjpe_mm=40.0)
+    distill: DistillStage = DistillStage()
+    ppo: PPOStage = field(default_factory=_polish)
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        for stage in self.stages:
+            if stage not in STAGES:
+                raise ConfigError(f"unknown stage {stage!r}{nearest(stage, STAGES)}; stages: {', '.join(STAGES)}")
+        missing = set(self.teacher_tokenizer.future) - set(self.tokenizer.future)
+        if missing:
+            raise ConfigError(
+                f"teacher_tokenizer.future looks {sorted(missing)} steps ahead, which tokenizer.future "
+                f"{self.tokenizer.future} does not hold; the teacher labels what the student sees"
+            )
+
+
+def sizes_of(table: ReferenceTable, future: tuple[int, ...]) -> dict[str, int]:
+    """Widths of the observation's parts for a future window."""
+    layout = Tracking(TrackingConfig(future=future), table, rows=1).layout
+    return {name: part.stop - part.start for name, part in layout.items()}
+
+
+def new_tokenizer(config: TokenizerConfig, table: ReferenceTable, seed: int) -> MotionTokenizer:
+    """A tokenizer with fresh weights whose actions start at the mean pose of the clips."""
+    torch.manual_seed(seed)
+    tokenizer = MotionTokenizer(config, sizes_of(table, config.future), table.character.nu)
+    with torch.no_grad():
+        tokenizer.action_mean.copy_(torch.from_numpy(table.target.mean(0)))
+        tokenizer.action_scale.copy_(torch.from_numpy(table.target.std(0)).clamp_min(0.1))
+    return tokenizer
+
+
+def fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int = 0, threads: int = 0) -> MotionTokenizer:
+    """Run the stages that are not finished yet and write the best tokenizer to `out`."""
+    library = ClipLibrary.of(clips)
+    names = [clip.name for clip in clips]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ConfigError(f"two clips are named {twice!r}; rename a file, the name says which teacher is whose")
+    out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    scores: dict[str, TrackingScore] = {}
+    if "teacher" in config.stages:
+        train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
+    table = ReferenceTable(library, control_hz=config.tokenizer.scene.control_hz)
+    student = new_tokenizer(config.tokenizer, table, seed)
+    story: list[str] = ["teacher"] if "teacher" in config.stages else []
+    if "distill" in config.stages:
+        teachers = [MotionTokenizer.from_pretrained(out / "teachers" / name) for name in names]
+        parents = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in names}
+        story.append("distill")
+        told = " -> ".join(story)
+        scores["distill"] = distill(
+            student,
+            teachers,
+            table,
+            config.distill,
+            out / "distill",
+            seed=seed,
+            threads=threads,
+            card=lambda score: tokenizer_card(student, names, told, seed, score),
+            parents=parents,
+        )
+    if "ppo" in config.stages:
+        story.append("ppo")
+        scores["ppo"] = train_ppo(
+            student,
+            table,
+            config.ppo,
+            out / "ppo",
+            seed=seed,
+            threads=threads,
+            title="ppo through the bottleneck",
+            card=lambda score: tokenizer_card(student, names, " -> ".join(story), seed, score),
+        )
+    if not scores:
+        return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
+    best = max(scores, key=lambda stage: scores[stage].merit)
+    for name in ("model.safetensors", "README.md", "config.json"):
+        shutil.copyfile(out / best / name, out / f".{name}.tmp")
+        (out / f".{name}.tmp").replace(out / name)
+    print(f"best stage: {best}; {scores[best].summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
+    return MotionTokenizer.from_pretrained(out)
+
+
+def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
+    """One expert per clip, `config.workers` at a time on one core each; finished ones are left alone."""
+    jobs = [(clip, config, out / clip.name, seed) for clip in clips if not (out / clip.name / "done").exists()]
+    if len(jobs) <= 1 or config.workers <= 1:
+        for job in jobs:
+            _teach(*job, threads=threads, quiet=False)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(config.workers, mp_context=context) as pool:
+        running = {pool.submit(_teach, *job, threads=1, quiet=True): job[0].name for job in jobs}
+        _report(running, len(jobs))
+
+
+def _report(running: dict, total: int) -> None:
+    """Wait for teachers and say how each did; the first error stops the rest from starting."""
+    for count, future in enumerate(as_completed(running), 1):
+        print(f"teacher {count}/{total} {running[future]}: {future.result()}", flush=True)
+
+
+def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool) -> str:
+    if threads:
+        torch.set_num_threads(threads)
+    settings = replace(config.teacher_tokenizer, scene=config.tokenizer.scene)
+    table = ReferenceTable(ClipLibrary.of([clip]), control_hz=settings.scene.control_hz)
+    teacher = new_tokenizer(settings, table, seed)
+    score = train_ppo(
+        teacher,
+        table,
+        config.teacher,
+        out,
+        seed=seed,
+        threads=threads,
+        title=f"teacher {clip.name}",
+        card=lambda score: tokenizer_card(teacher, [clip.name], "teacher", seed, score),
+        quiet=quiet,
+    )
+    (out / "done").touch()
+    return f"success {score.success.mean():.2f}, {score.mpjpe_mm.mean():.0f} mm"
+
+
+def tokenizer_card(
+    tokenizer: MotionTokenizer, names: Sequence[str], story: str, seed: int, score: TrackingScore
+) -> str:
+    """The model card: use, training, inputs and outputs, results and limits."""
+    config = tokenizer.config
+    kind = config.quantizer.kind
+    rows = "\n".join(
+        f"| {name} | {100 * s:.0f} % | {100 * m:.0f} % | {e:.0f} |"
+        for name, s, m, e in zip(score.names, score.success, score.success_mean_error, score.mpjpe_mm, strict=True)
+    )
+    tokens = (
+        ""
+        if kind == "continuous"
+        else (
+            f"{tokenizer.layout.tokens_per_step} tokens per control step from a vocabulary of "
+            f"{tokenizer.layout.vocabulary}; "
+        )
+    )
+    return f"""# {kind} motion tokenizer for `{config.character}`
+
+Turns a reference motion into codes and codes into joint torques, in physics at {config.scene.control_hz} Hz.
+
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+    tokenizer = MotionTokenizer.from_pretrained("PATH")
+
+- Encoder input: {", ".join(config.encoder_inputs)} with future frames {list(config.future)}; decoder input:
+  {", ".join(config.decoder_inputs) or "nothing"} and the code. Output: {tokenizer.actions} PD targets in radians.
+- {tokens}quantizer `{to_dict(config.quantizer)}`.
+- Stages: {story}. Seed {seed}. Clips: {", ".join(names)}.
+
+## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, no noise
+
+Success: largest body error of the episode below 0.5 m; mean form: mean body error below 0.5 m.
+
+| clip | success | success (mean form) | MPJPE mm |
+|---|---|---|---|
+{rows}
+| all | {100 * score.success.mean():.1f} % | {100 * score.success_mean_error.mean():.1f} % | {score.mpjpe_mm.mean():.1f} |
+
+Limits: flat floor, no self-collision, the clips above. Licence: Apache-2.0.
+"""
