@@ -37,6 +37,7 @@ from kinetok import __version__
 from kinetok.config import nearest
 
 CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
+PACKAGED = Path(__file__).parent / "assets"
 Tensors = dict[str, torch.Tensor]
 
 # safetensors writes metadata in random order: with a second key, equal tensors would have different hashes.
@@ -89,8 +90,11 @@ def save_artifact(
 
 
 def load_artifact(path: Path | str, kind: str | None = None) -> Artifact:
-    """Read and verify an artifact directory. kind: what it must be; None accepts any."""
-    path = Path(path)
+    """Read and verify an artifact. kind: what it must be; None accepts any.
+
+    path: its directory, or the name of one that comes with kinetok (`packaged()` lists them).
+    """
+    path = locate(path)
     header = _read_header(path)
     if kind is not None and header["kind"] != kind:
         raise CheckpointError(f"{path} is a {header['kind']!r}; a {kind!r} was asked for")
@@ -109,6 +113,21 @@ def load_artifact(path: Path | str, kind: str | None = None) -> Artifact:
         parents=header["parents"],
         hash=found,
     )
+
+
+def packaged() -> list[str]:
+    """Names of the artifacts that come with kinetok."""
+    return sorted(entry.parent.name for entry in PACKAGED.glob(f"*/{CONFIG}"))
+
+
+def locate(path: Path | str) -> Path:
+    """The directory itself where it exists, else the packaged artifact of that name."""
+    path = Path(path)
+    if path.is_dir() or path.parent != Path():
+        return path
+    if path.name in packaged():
+        return PACKAGED / path.name
+    return path
 
 
 def require_parent(artifact: Artifact, role: str, parent_hash: str, parent_path: Path | str) -> None:
@@ -271,7 +290,9 @@ def _is_ours(path: Path) -> bool:
 def _read_header(path: Path) -> dict[str, Any]:
     if not path.is_dir():
         siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise CheckpointError(f"there is no directory {path}{nearest(path.name, siblings)}")
+        names = packaged() if path.parent == Path() else []
+        known = f"; packaged: {', '.join(names)}" if names else ""
+        raise CheckpointError(f"there is no directory {path}{nearest(path.name, siblings + names)}{known}")
     if not (path / CONFIG).is_file():
         raise CheckpointError(f"{path} has no {CONFIG}; it is not an artifact, or its first save was cut short")
     try:

@@ -153,5 +153,155 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
     fit(load_clips(paths), config, out, seed=seed, threads=threads)
 
 
+@tokenize.command("encode")
+@click.argument("clip", type=PATHS)
+@click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
+@click.option("--out", required=True, type=PATHS, help="Token file to write, ending in .safetensors.")
+@click.option("--seconds", type=float, default=None, help="How long to track; default once through the clip.")
+def tokenize_encode(clip, tokenizer, out, seconds) -> None:
+    """Write the tokens of a clip: (T, S) int64, one row per control step, with their layout."""
+    from kinetok.tokenizers.codec import encode_clip
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    found = load_clips((clip,))
+    if len(found) > 1:
+        raise ValueError(f"{clip} holds {len(found)} clips; encode one at a time")
+    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), found[0], seconds=seconds)
+    stream.save(out)
+    click.echo(f"wrote {out}: tokens {tuple(stream.tokens.shape)}, {stream.layout}")
+
+
+@tokenize.command("decode")
+@click.argument("tokens", type=PATHS)
+@click.option("--tokenizer", required=True, type=PATHS, help="The tokenizer that wrote the tokens.")
+@click.option("--out", required=True, type=PATHS, help="A clip library (.safetensors) or a video (.mp4).")
+def tokenize_decode(tokens, tokenizer, out) -> None:
+    """Play tokens in simulation from their first state; no reference is involved."""
+    from kinetok.tokenizers.codec import TokenStream, decode_tokens
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    stream = TokenStream.load(tokens)
+    model = MotionTokenizer.from_pretrained(tokenizer)
+    write_motion(out, model.config.character, decode_tokens(model, stream), stream.fps, stream.name)
+
+
+def write_motion(out: Path, character: str, qpos, fps: float, name: str, caption: str = "") -> None:
+    """Write poses (T, nq) as a clip library or as a video, by the file's suffix."""
+    from kinetok.motion.character import Character
+    from kinetok.motion.clip import Clip
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.render.video import render_frames, write_video
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".mp4":
+        write_video(out, render_frames(Character.load(character), qpos, fps=fps, caption=caption), fps)
+    elif out.suffix == ".safetensors":
+        ClipLibrary.write(out, [Clip(name=name, character=character, fps=fps, qpos=qpos, source="simulated")])
+    else:
+        raise ValueError(f"{out}: unknown suffix {out.suffix!r}; write .mp4 or .safetensors")
+    click.echo(f"wrote {out}: {len(qpos)} frames at {fps:g} fps")
+
+
+@main.command()
+@click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
+@click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
+@configured("laptop")
+def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
+    """Train the prior: a GPT over the tokens of the frozen tracker's own roll-outs.
+
+    \b
+    Example: kinetok pretrain --tokenizer runs/walk --clips walk.txt --out runs/prior
+    """
+    from kinetok import presets
+    from kinetok.config import override, pick
+    from kinetok.gpt.pretrain import pretrain as train
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    config = override(pick(presets.PRETRAIN, preset, "preset")(), settings)
+    train(MotionTokenizer.from_pretrained(tokenizer), load_clips(paths), config, out, seed=seed, threads=threads)
+
+
+@main.command()
+@click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
+@click.option("--seconds", default=10.0, show_default=True)
+@click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
+@click.option("--temperature", default=1.0, show_default=True)
+@click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
+@click.option("--push", default=0.0, help="Push the character at 6.7 s, in m/s.")
+@click.option("--seed", default=0, show_default=True)
+def sample(prior, out, seconds, top_p, temperature, count, push, seed) -> None:
+    """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics)."""
+    from kinetok.evaluate import measure
+    from kinetok.gpt.controller import Prior, roll
+    from kinetok.motion.clip import Clip
+    from kinetok.motion.library import ClipLibrary
+
+    if out.suffix != ".mp4":
+        raise ValueError(f"{out}: the video's name must end in .mp4")
+    model = Prior.from_pretrained(prior)
+    character = model.tokenizer.config.character
+    recording = roll(model, rows=count, seconds=seconds, top_p=top_p, temperature=temperature, push=push, seed=seed)
+    write_motion(out, character, recording.qpos[:, 0], recording.fps, "sample")
+    motion = [
+        Clip(name=f"sample{i}", character=character, fps=recording.fps, qpos=recording.qpos[:, i], source=str(prior))
+        for i in range(count)
+    ]
+    ClipLibrary.write(out.with_suffix(".safetensors"), motion)
+    show_json(measure(recording) | {"seed": seed, "top_p": top_p, "prior": str(prior)}, out.with_suffix(".json"))
+
+
+@main.group(cls=Chain)
+def evaluate() -> None:
+    """Numbers with a seed: how well a tracker tracks, and how long a prior lives."""
+
+
+@evaluate.command("tracking")
+@click.option("--tokenizer", default="humanoid-fsq", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
+@click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
+@click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@click.option("--threads", default=0)
+@click.option("--seed", default=0, show_default=True)
+def evaluate_tracking(tokenizer, paths, out, episodes, push, threads, seed) -> None:
+    """Success rate and MPJPE of a tokenizer (or a teacher) on clips, by clip and overall."""
+    from kinetok.evaluate import evaluate_tracking as score
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    model = MotionTokenizer.from_pretrained(tokenizer)
+    show_json(score(model, load_clips(paths), episodes=episodes, push=push, threads=threads, seed=seed), out)
+
+
+@evaluate.command("prior")
+@click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
+@click.option("--episodes", default=64, show_default=True)
+@click.option("--seconds", default=20.0, show_default=True)
+@click.option("--push", default=0.0, help="Push every character once, at step 200, by so many m/s.")
+@click.option("--top-p", default=0.9, show_default=True)
+@click.option("--threads", default=0)
+@click.option("--seed", default=0, show_default=True)
+def evaluate_prior(prior, out, episodes, seconds, push, top_p, threads, seed) -> None:
+    """Survival, diversity and smoothness of motion sampled from a prior, from random reference states."""
+    from kinetok.evaluate import evaluate_prior as score
+    from kinetok.gpt.controller import Prior
+
+    model = Prior.from_pretrained(prior)
+    show_json(score(model, episodes=episodes, seconds=seconds, push=push, top_p=top_p, threads=threads, seed=seed), out)
+
+
+@main.command()
+@click.option("--out", default=Path("kinetok-demo"), show_default=True, type=PATHS, help="Folder for the videos.")
+@click.option("--seconds", default=8.0, show_default=True)
+@click.option("--seed", default=0, show_default=True)
+def demo(out, seconds, seed) -> None:
+    """Track a packaged clip, show its tokens, sample new motion; two videos and a table, in under two minutes."""
+    from kinetok.demo import run_demo
+
+    run_demo(out, seconds=seconds, seed=seed)
+
+
 if __name__ == "__main__":
     sys.exit(main())

@@ -25,9 +25,9 @@ def many_clips() -> FitConfig:
     return FitConfig(
         tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=30, levels=9), encoder=(512, 256), decoder=(512, 256)),
         teacher=PPOStage(
-            samples=3_000_000,
+            samples=2_000_000,
             stop_success=1.0,
-            stop_mpjpe_mm=35.0,
+            stop_mpjpe_mm=30.0,
             env=EnvConfig(reset_noise=0.02, push=1.0),
         ),
         distill=DistillStage(samples=1_500_000, rows=512, minibatch=2048, memory=262_144, eval_every=150_000,

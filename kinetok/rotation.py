@@ -52,7 +52,8 @@ def rotate(q: Array, v: Array) -> Array:
 
 def from_rotvec(v: Array) -> Array:
     """Exponential map: rotation vectors (..., 3) in radians to quaternions (..., 4)."""
-    v = np.asarray(v, dtype=np.result_type(v, np.float32))
+    v = np.asarray(v)
+    v = v.astype(np.result_type(v, np.float32), copy=False)
     half = np.linalg.norm(v, axis=-1, keepdims=True) / 2
     return np.concatenate([np.cos(half), v * np.sinc(half / np.pi) / 2], axis=-1)
 

@@ -28,10 +28,10 @@ class Clip:
     source: str = ""
 
     def __post_init__(self) -> None:
-        nq = Character.load(self.character).nq
-        if self.qpos.ndim != 2 or self.qpos.shape[1] != nq:
+        body = Character.load(self.character)
+        if self.qpos.ndim != 2 or self.qpos.shape[1] != body.nq:
             raise ValueError(
-                f"clip {self.name!r}: qpos has shape {self.qpos.shape}; {self.character!r} needs (T, {nq})"
+                f"clip {self.name!r}: qpos has shape {self.qpos.shape}; {self.character!r} needs (T, {body.nq})"
             )
         if len(self.qpos) < 2:
             raise ValueError(f"clip {self.name!r}: {len(self.qpos)} frames; a motion needs at least two")
@@ -40,6 +40,15 @@ class Clip:
         if not np.isfinite(self.qpos).all():
             frame, column = np.argwhere(~np.isfinite(self.qpos))[0]
             raise ValueError(f"clip {self.name!r}: frame {frame}, column {column} is {self.qpos[frame, column]}")
+        first = quaternion_columns(body)
+        norms = np.linalg.norm(self.qpos[:, first[:, None] + np.arange(4)], axis=-1)
+        if (np.abs(norms - 1) > 1e-3).any():
+            frame, index = np.argwhere(np.abs(norms - 1) > 1e-3)[0]
+            column = first[index]
+            raise ValueError(
+                f"clip {self.name!r}: frame {frame}, columns {column}-{column + 3}: a quaternion of norm "
+                f"{norms[frame, index]:.4g} is no rotation; see rotation.normalize"
+            )
 
     @property
     def seconds(self) -> float:

@@ -21,18 +21,18 @@ from kinetok.rl.rollout import Rollout
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
     """horizon: steps per rollout; log_std: spread at the first and at the last iteration; lr: starting rate of the
-    actor, lr_max: its ceiling; bound: penalty for mean actions beyond their range is the quantizer's business."""
+    actor, lr_max: its ceiling; target_kl: the divergence per update it aims at."""
 
     horizon: int = 16
     epochs: int = 3
-    minibatch: int = 2048
+    minibatch: int = 1024
     clip: float = 0.2
     gamma: float = 0.97
     lam: float = 0.95
     lr: float = 4e-4
     lr_max: float = 1e-3
     critic_lr: float = 1e-3
-    target_kl: float = 0.015
+    target_kl: float = 0.03
     log_std: tuple[float, float] = (-2.6, -2.9)
     max_grad_norm: float = 1.0
     anchor: float = 0.0

@@ -24,7 +24,8 @@ from kinetok.sim.scene import SceneConfig, build_scene
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig:
     """episode_seconds: longest episode; reset_noise: radians; push: m/s added to the root's horizontal velocity,
-    every push_seconds on average (exactly, when push_regular); friction: range of the floor's friction."""
+    every push_seconds on average (exactly, when push_regular); friction: range of the floor's friction;
+    autoreset: reset finished rows within step; without it they simply go on."""
 
     scene: SceneConfig = SceneConfig()
     episode_seconds: float = 10.0
@@ -33,6 +34,7 @@ class EnvConfig:
     push_seconds: float = 2.0
     push_regular: bool = False
     friction: tuple[float, float] = (1.0, 1.0)
+    autoreset: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,7 @@ class Env:
         final = obs[done]
         if len(failed):
             final = np.where(np.isfinite(final), final, 0.0)
-        if len(done):
+        if len(done) and self.config.autoreset:
             self._finished.append((self._returns[done].copy(), self.age[done].copy(), terminated[done]))
             self.task.finished(done, terminated[done])
             self._start(done)

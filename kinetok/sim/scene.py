@@ -63,4 +63,5 @@ def _floor(spec: mujoco.MjSpec, friction: float) -> None:
         friction=np.array([friction, 0.05, 0.05]),
         contype=1,
         conaffinity=1,
+        priority=1,  # else a contact takes the larger friction of its two geoms: a slippery floor would not slip
     )

@@ -39,10 +39,10 @@ STAGES = ("teacher", "distill", "ppo")
 
 def _teacher_tokenizer() -> TokenizerConfig:
     return TokenizerConfig(
-        quantizer=ContinuousConfig(dim=128),
-        future=(1, 2),
+        quantizer=ContinuousConfig(dim=64),
+        future=(1, 2, 7),
         encoder=(256,),
-        decoder=(),
+        decoder=(128,),
         encoder_inputs=("window", "error"),
         decoder_inputs=(),
         residual=True,
@@ -202,6 +202,10 @@ def tokenizer_card(
         f"| {name} | {100 * s:.0f} % | {100 * m:.0f} % | {e:.0f} |"
         for name, s, m, e in zip(score.names, score.success, score.success_mean_error, score.mpjpe_mm, strict=True)
     )
+    total = (
+        f"| all | {100 * score.success.mean():.1f} % | {100 * score.success_mean_error.mean():.1f} % "
+        f"| {score.mpjpe_mm.mean():.1f} |"
+    )
     tokens = (
         ""
         if kind == "continuous"
@@ -229,7 +233,7 @@ Success: largest body error of the episode below 0.5 m; mean form: mean body err
 | clip | success | success (mean form) | MPJPE mm |
 |---|---|---|---|
 {rows}
-| all | {100 * score.success.mean():.1f} % | {100 * score.success_mean_error.mean():.1f} % | {score.mpjpe_mm.mean():.1f} |
+{total}
 
 Limits: flat floor, no self-collision, the clips above. Licence: Apache-2.0.
 """

@@ -67,6 +67,7 @@ class MotionTokenizer(nn.Module):
     def __init__(self, config: TokenizerConfig, sizes: Mapping[str, int], actions: int):
         super().__init__()
         self.config, self.sizes, self.actions = config, dict(sizes), actions
+        self.hash = ""  # of the artifact it was loaded from
         edge, self._cut = 0, {}
         for part in (*PARTS, "target"):
             self._cut[part] = slice(edge, edge + sizes[part])
@@ -142,4 +143,5 @@ class MotionTokenizer(nn.Module):
         config = from_dict(TokenizerConfig, artifact.config["tokenizer"])
         tokenizer = MotionTokenizer(config, artifact.config["sizes"], artifact.config["actions"])
         tokenizer.load_state_dict(artifact.tensors)
+        tokenizer.hash = artifact.hash
         return tokenizer.eval()

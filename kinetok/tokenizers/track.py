@@ -73,12 +73,13 @@ def track(
     task = Tracking(config, table, rows=rows, fixed=fixed, starts=starts)
     env_config = EnvConfig(
         scene=scene or SceneConfig(),
-        episode_seconds=seconds,
+        episode_seconds=float(max(seconds, table.cycle.max() / table.control_hz)) + 1,
         push=push,
         push_seconds=push_seconds,
         push_regular=True,
     )
     env = Env(env_config, task, rows=rows, threads=threads, seed=seed)
+    limit = np.where(loops[fixed], round(seconds * table.control_hz), np.inf)
     running, failed = np.ones(rows, bool), np.zeros(rows, bool)
     largest, total, frames = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     obs = env.reset()
@@ -91,7 +92,7 @@ def track(
             total[running] += np.minimum(error.mean(1), 1.0)
             frames[running] += 1
             failed |= running & step.terminated
-            running &= ~(step.terminated | step.truncated)
+            running &= ~(step.terminated | step.truncated) & (frames < limit)
 
     def per_clip(values: np.ndarray) -> np.ndarray:
         return values.reshape(clips, episodes).mean(1)

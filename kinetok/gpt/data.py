@@ -1,0 +1,278 @@
+"""What a prior learns from: the tokens a frozen tokenizer chose, and the states it chose them in.
+
+    data = record(tokenizer, table, samples=400_000, rows=256, seed=0, threads=2, env=EnvConfig(push=0.5))
+    data.save(out / "tokens.safetensors", {})
+    data.states, data.tokens                       # (M, S) float32, (M, T) int32
+
+GPC sec. 6 trains its prior on rollouts of the frozen tracker. The worlds are driven by decode(codes), never by
+the reference, so the states are those the decoder itself produces; pushes and noisy starts put recoveries among
+them. Clips are drawn half of the time each as often as any other, half of the time by their duration, whatever
+the tracker fails at. The last half second before a failure is left out.
+
+`Roaming` joins the clips into one endless motion. Physics on a flat floor does not change when the world is
+shifted and turned, so a row goes on in another clip by having its own root moved to a frame of that clip which
+it resembles already. This happens at random (`transitions` per second) and, wherever a like frame exists,
+before a clip ends: the prior learns what follows an end, and how to change from one clip to another.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from einops import rearrange
+from torch import Tensor
+
+from kinetok import rotation
+from kinetok.checkpoint import load_state, save_state
+from kinetok.logger import Logger
+from kinetok.rl.rollout import torch_threads
+from kinetok.sim import observe
+from kinetok.sim.batch import BodyState
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+BEFORE_FAILURE = 0.5  # seconds
+REACH = 0.25  # metres of `likeness`; walk to run, or the end of a jump to standing, is about 0.2
+GLANCE = 0.1  # seconds; a velocity difference counts as the distance it makes in this time
+STARTS = 512
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Starts:
+    """States to begin from: qpos (K, nq), qvel (K, nv) float64; clip (K,): which clip each was taken from."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    clip: np.ndarray
+
+    def tensors(self, prefix: str = "starts.") -> dict[str, Tensor]:
+        """Named tensors to save; `of` reads them back."""
+        return {prefix + name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in vars(self).items()}
+
+    @classmethod
+    def of(cls, tensors: dict[str, Tensor], prefix: str = "starts.") -> "Starts":
+        return cls(**{name: tensors[prefix + name].numpy() for name in ("qpos", "qvel", "clip")})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TokenDataset:
+    """M control steps. states (M, S) float32; tokens (M, T) int32 chosen in them; clip (M,): index into names;
+    world (M,): the simulation it was seen in; starts: reference states of the same clips."""
+
+    states: Tensor = field(repr=False)
+    tokens: Tensor = field(repr=False)
+    clip: Tensor = field(repr=False)
+    world: Tensor = field(repr=False)
+    names: tuple[str, ...]
+    starts: Starts = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (S,) of the states."""
+        std, mean = torch.std_mean(self.states.double(), dim=0, correction=0)
+        return mean.float(), std.float()
+
+    def split(self, share: float) -> tuple[Tensor, Tensor]:
+        """Sample ids (M1,), (M2,) to learn from and to hold out: whole worlds, as neighbours in time are alike."""
+        if not 0 <= share < 1:
+            raise ValueError(f"the held-out share must lie in [0, 1), not {share}")
+        worlds = self.world.unique()
+        held = max(1, round(len(worlds) * share)) if share else 0
+        if held >= len(worlds):
+            raise ValueError(f"cannot hold out {held} of {len(worlds)} worlds; record with more rows")
+        out = torch.isin(self.world, worlds[len(worlds) - held :])
+        return torch.nonzero(~out).flatten(), torch.nonzero(out).flatten()
+
+    def save(self, path: Path, meta: dict[str, Any]) -> None:
+        """Write one file; meta is JSON-able and comes back from `load`."""
+        tensors = {name: getattr(self, name) for name in ("states", "tokens", "clip", "world")}
+        save_state(path, tensors | self.starts.tensors(), {"names": list(self.names), "meta": meta})
+
+    @classmethod
+    def load(cls, path: Path) -> tuple["TokenDataset", dict[str, Any]]:
+        """The data set and the meta that `save` wrote."""
+        tensors, meta = load_state(path)
+        parts = {name: tensors[name] for name in ("states", "tokens", "clip", "world")}
+        return cls(**parts, names=tuple(meta["names"]), starts=Starts.of(tensors)), meta["meta"]
+
+
+class Roaming(Tracking):
+    """Tracking that goes on in another clip, `transitions` times per second on average and where a clip ends.
+
+    `over` leaves the frame at which each row is to go on in `landing` (rows,), -1 for most; `land` moves it there.
+    A clip's last `tail` steps, in which the window ahead begins to stand still, are left at a moment drawn
+    uniformly. A row that resembles no frame of any clip at its clip's end is truncated, as in Tracking.
+    """
+
+    def __init__(
+        self,
+        config: TrackingConfig,
+        table: ReferenceTable,
+        *,
+        rows: int,
+        transitions: float,
+        rng: np.random.Generator,
+        reach: float = REACH,
+    ):
+        super().__init__(config, table, rows=rows)
+        self.weights.values = clip_weights(table)
+        self.landing = np.full(rows, -1)
+        self.tail, self._rng, self._reach = max(config.future), rng, reach
+        self._chance = transitions / table.control_hz
+        # A clip is entered at any phase of its first cycle, or where at least a tail or half of it is left.
+        span = table.last - table.first
+        latest = np.where(span > table.cycle, table.cycle - 1, np.maximum(span - self.tail, span // 2))
+        self._entries = np.concatenate([np.arange(a, a + b + 1) for a, b in zip(table.first, latest, strict=True)])
+        self._edges = np.cumsum(latest + 1) - (latest + 1)
+        self._features = likeness(table.body.rows(self._entries))
+
+    def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        self.landing[ids] = -1
+        return super().start(ids, rng)
+
+    def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
+        terminated, over = super().over(body)
+        left = self.table.last[self.clip] - self.frame
+        chance = np.where(left <= self.tail, 1 / np.maximum(left, 1), self._chance)
+        seeking = np.flatnonzero((self._rng.random(len(left)) < chance) & ~terminated)
+        self.landing[:] = -1
+        if len(seeking):
+            self.landing[seeking] = self._nearest(body.rows(seeking), seeking, left[seeking] <= self.tail)
+        return terminated, over & (self.landing < 0)
+
+    def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
+        """The weights of the clips stay as they are: this task records, it does not train."""
+
+    def land(self, env: Env, obs: np.ndarray) -> None:
+        """Move the rows of env that `landing` names into their new clips; obs (N, O) is renewed in place."""
+        ids = np.flatnonzero(self.landing >= 0)
+        if not len(ids):
+            return
+        frame = self.landing[ids]
+        self.clip[ids] = np.searchsorted(self.table.first, frame, side="right") - 1
+        self.frame[ids], self.landing[ids] = frame, -1
+        place = self.table.root[frame, :2], self.table.heading[frame]
+        env.sim.set_state(ids, *moved(env.sim.qpos[ids], env.sim.qvel[ids], *place))
+        obs[ids] = self.observe(env.sim.state(ids), ids)
+
+    def _nearest(self, body: BodyState, ids: np.ndarray, ending: np.ndarray) -> np.ndarray:
+        """The likest frame (k,) in a random one of the clips within reach; -1 without. Its own clip only if ending."""
+        own = likeness(body)
+        squares = (own**2).sum(1)[:, None] + (self._features**2).sum(1) - 2 * own @ self._features.T
+        best = np.minimum.reduceat(squares, self._edges, axis=1)
+        best[np.flatnonzero(~ending), self.clip[ids[~ending]]] = np.inf
+        near = best < self._reach**2
+        chosen = np.where(near, self._rng.random(near.shape), -1).argmax(1)
+        stop = np.append(self._edges[1:], len(self._entries))
+        frame = np.full(len(ids), -1)
+        for row in np.flatnonzero(near.any(1)):
+            first = self._edges[chosen[row]]
+            frame[row] = self._entries[first + squares[row, first : stop[chosen[row]]].argmin()]
+        return frame
+
+
+def likeness(body: BodyState) -> np.ndarray:
+    """Features (N, F) whose distance is that of two states in metres, blind to place and heading: root height,
+    and the root mean squares over bodies of the relative positions and of GLANCE times the velocities."""
+    state, bodies = observe.state_features(body), body.pos.shape[1]
+    pos = state[:, 1 : 1 + (bodies - 1) * 3]
+    linear = state[:, 1 + (bodies - 1) * 3 + bodies * 6 : 1 + (bodies - 1) * 3 + bodies * 9]
+    return np.concatenate([state[:, :1], pos / bodies**0.5, linear * (GLANCE / bodies**0.5)], axis=1)
+
+
+def moved(
+    qpos: np.ndarray, qvel: np.ndarray, xy: np.ndarray, heading: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same states (n, nq), (n, nv) with the root at xy (n, 2) and turned to heading (n,): physics cannot tell.
+
+    Of a free joint's velocity the linear part is in the world frame and turns along, the angular part is local.
+    """
+    qpos, qvel = qpos.copy(), qvel.copy()
+    angle = heading - rotation.heading(qpos[:, 3:7])
+    qpos[:, :2] = xy
+    qpos[:, 3:7] = rotation.multiply(rotation.about_z(angle), qpos[:, 3:7])
+    qvel[:, :3] = rotation.turn(qvel[:, :3], np.cos(angle), np.sin(angle))
+    return qpos, qvel
+
+
+def clip_weights(table: ReferenceTable) -> np.ndarray:
+    """How often each clip (K,) is drawn: half uniformly, half by duration; the sum is 1."""
+    return 0.5 / len(table.names) + 0.5 * table.cycle / table.cycle.sum()
+
+
+def draw_starts(table: ReferenceTable, count: int, rng: np.random.Generator) -> Starts:
+    """`count` random frames of the clips' first cycles, clips drawn by `clip_weights`."""
+    clip = rng.choice(len(table.names), size=count, p=clip_weights(table))
+    frame = table.first[clip] + (rng.random(count) * table.cycle[clip]).astype(int)
+    return Starts(qpos=table.qpos[frame], qvel=table.qvel[frame], clip=clip.astype(np.int64))
+
+
+def before_failure(terminated: np.ndarray, done: np.ndarray, steps: int) -> np.ndarray:
+    """Which of (T, N) control steps are among the last `steps` of an episode that failed.
+
+    terminated, done (T, N) bool: the step failed; the step was its episode's last for whatever reason.
+    """
+    doomed = terminated.copy()
+    for _ in range(steps - 1):
+        doomed[:-1] |= doomed[1:] & ~done[:-1]
+    return doomed
+
+
+def record(
+    tokenizer: MotionTokenizer,
+    table: ReferenceTable,
+    *,
+    samples: int = 400_000,
+    rows: int = 256,
+    seed: int = 0,
+    threads: int = 0,
+    env: EnvConfig | None = None,
+    transitions: float = 0.3,
+    quiet: bool = False,
+) -> TokenDataset:
+    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
+
+    env: pushes, noise and episode length; the physics is the tokenizer's own. The result depends on `seed` and not
+    on `threads`.
+    """
+    layout, scene = tokenizer.layout, tokenizer.config.scene
+    rng = np.random.default_rng([seed, 1])
+    tracking = TrackingConfig(future=tokenizer.config.future)
+    task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng)
+    world = Env(replace(env or EnvConfig(), scene=scene), task, rows=rows, threads=threads, seed=seed)
+    steps, part = -(-samples // rows), task.layout["state"]
+    states = torch.empty(steps, rows, part.stop - part.start)
+    tokens = torch.empty(steps, rows, layout.tokens_per_step, dtype=torch.int32)
+    clip, terminated, done = np.empty((steps, rows), np.int32), *np.zeros((2, steps, rows), bool)
+    obs = world.reset(spread=True)
+    log = Logger(None, total=samples, title="record", quiet=quiet)
+    with torch.no_grad(), torch_threads(1), log:
+        for t in range(steps):
+            seen = torch.from_numpy(obs)
+            codes = tokenizer.encode(seen)
+            states[t], tokens[t], clip[t] = seen[:, part], layout.to_tokens(codes), task.clip
+            step = world.step(tokenizer.decode(codes, seen[:, part]).numpy())
+            terminated[t], done[t], obs = step.terminated, step.terminated | step.truncated, step.obs
+            task.land(world, obs)
+            if t % 20 == 19 or t == steps - 1:
+                log.write((t + 1) * rows - 1, world.episode_metrics())
+    good = ~before_failure(terminated, done, round(BEFORE_FAILURE * scene.control_hz))
+    if not good.any():
+        raise ValueError(
+            f"the tokenizer follows none of {', '.join(table.names)} for more than {BEFORE_FAILURE} s, so there is "
+            "nothing to learn from; look at `kinetok evaluate` of the tokenizer, and fit it longer"
+        )
+    kept = torch.from_numpy(good.ravel())
+    return TokenDataset(
+        states=rearrange(states, "t n s -> (t n) s")[kept],
+        tokens=rearrange(tokens, "t n s -> (t n) s")[kept],
+        clip=torch.from_numpy(clip.ravel())[kept],
+        world=torch.arange(rows, dtype=torch.int32).repeat(steps)[kept],
+        names=tuple(table.names),
+        starts=draw_starts(table, STARTS, np.random.default_rng([seed, 2])),
+    )
