@@ -78,7 +78,7 @@ def save_artifact(
     parents: role -> hash of each artifact this one depends on, checked later by `require_parent`.
     """
     path = Path(path)
-    _refuse_foreign(path)
+    refuse_foreign(path)
     header = {"kinetok": __version__, "kind": kind, "hash": "", "parents": parents or {}, "config": config}
     _check_json(header, "config")
     path.mkdir(parents=True, exist_ok=True)
@@ -264,7 +264,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _refuse_foreign(path: Path) -> None:
+def refuse_foreign(path: Path) -> None:
     """Refuse to write over a file, or over a config.json, model.safetensors or README.md that is not ours."""
     if path.exists() and not path.is_dir():
         raise CheckpointError(f"{path} is a file; an artifact is a directory, choose another path")

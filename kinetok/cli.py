@@ -23,30 +23,43 @@ class Chain(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context):
-        from kinetok.checkpoint import CheckpointError
-
         try:
             return super().invoke(ctx)
-        except (ValueError, CheckpointError, FileNotFoundError, FloatingPointError, ImportError) as error:
-            if os.environ.get("KINETOK_TRACEBACK"):
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except Exception as error:
+            from kinetok.checkpoint import CheckpointError
+
+            expected = (ValueError, CheckpointError, OSError, FloatingPointError, ImportError)
+            if os.environ.get("KINETOK_TRACEBACK") or not isinstance(error, expected):
                 raise
             raise click.ClickException(str(error)) from error
+
+
+NATURAL = click.IntRange(min=0)
+option_seed = click.option(
+    "--seed", default=0, show_default=True, type=NATURAL, help="Seeds weights, worlds and noise; the same repeats it."
+)
+option_threads = click.option(
+    "--threads",
+    default=0,
+    show_default=True,
+    type=NATURAL,
+    help="Threads of physics and networks; 0 is every core. Changes speed only.",
+)
 
 
 def configured(presets: str):
     """--preset, --set, --seed and --threads, the same on every training command."""
 
     def decorate(command):
-        command = click.option("--seed", default=0, show_default=True, help="Seeds weights, worlds and noise.")(command)
-        command = click.option(
-            "--threads", default=0, help="Threads of physics and networks; 0 is every core. Changes speed only."
-        )(command)
+        command = option_seed(option_threads(command))
         command = click.option(
             "--set",
             "settings",
             multiple=True,
             metavar="KEY=VALUE",
-            help="Change one setting, e.g. teacher.samples=1e6.",
+            help="Change one setting, e.g. teacher.samples=1000000.",
         )(command)
         return click.option("--preset", default=presets, show_default=True, help="Where the settings start from.")(
             command
@@ -59,6 +72,12 @@ def load_clips(paths: tuple[Path, ...]):
     from kinetok.motion.formats import read_clips
 
     return [clip for path in paths for clip in read_clips(path)]
+
+
+def check_suffix(out: Path, *allowed: str) -> None:
+    """Refuse a file name before any work is done for it."""
+    if out.suffix not in allowed:
+        raise ValueError(f"--out {out}: the name must end in {' or '.join(allowed)}")
 
 
 def show_json(data: dict, out: Path | None) -> None:
@@ -119,6 +138,7 @@ def clips_import(paths: tuple[Path, ...], out: Path) -> None:
     """Read motion files of any known format and write one memory-mapped library."""
     from kinetok.motion.library import ClipLibrary
 
+    check_suffix(out, ".safetensors")
     found = load_clips(paths)
     ClipLibrary.write(out, found)
     click.echo(f"wrote {out}: {len(found)} clips, {sum(c.seconds for c in found):.1f} s")
@@ -163,6 +183,7 @@ def tokenize_encode(clip, tokenizer, out, seconds) -> None:
     from kinetok.tokenizers.codec import encode_clip
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
+    check_suffix(out, ".safetensors")
     found = load_clips((clip,))
     if len(found) > 1:
         raise ValueError(f"{clip} holds {len(found)} clips; encode one at a time")
@@ -180,6 +201,7 @@ def tokenize_decode(tokens, tokenizer, out) -> None:
     from kinetok.tokenizers.codec import TokenStream, decode_tokens
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
+    check_suffix(out, ".safetensors", ".mp4")
     stream = TokenStream.load(tokens)
     model = MotionTokenizer.from_pretrained(tokenizer)
     write_motion(out, model.config.character, decode_tokens(model, stream), stream.fps, stream.name)
@@ -190,15 +212,15 @@ def write_motion(out: Path, character: str, qpos, fps: float, name: str, caption
     from kinetok.motion.character import Character
     from kinetok.motion.clip import Clip
     from kinetok.motion.library import ClipLibrary
-    from kinetok.render.video import render_frames, write_video
 
+    check_suffix(out, ".safetensors", ".mp4")
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".mp4":
+        from kinetok.render.video import render_frames, write_video
+
         write_video(out, render_frames(Character.load(character), qpos, fps=fps, caption=caption), fps)
-    elif out.suffix == ".safetensors":
-        ClipLibrary.write(out, [Clip(name=name, character=character, fps=fps, qpos=qpos, source="simulated")])
     else:
-        raise ValueError(f"{out}: unknown suffix {out.suffix!r}; write .mp4 or .safetensors")
+        ClipLibrary.write(out, [Clip(name=name, character=character, fps=fps, qpos=qpos, source="simulated")])
     click.echo(f"wrote {out}: {len(qpos)} frames at {fps:g} fps")
 
 
@@ -219,28 +241,36 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
     config = override(pick(presets.PRETRAIN, preset, "preset")(), settings)
-    train(MotionTokenizer.from_pretrained(tokenizer), load_clips(paths), config, out, seed=seed, threads=threads)
+    train(
+        MotionTokenizer.from_pretrained(tokenizer),
+        load_clips(paths),
+        config,
+        out,
+        tokenizer_path=tokenizer,
+        seed=seed,
+        threads=threads,
+    )
 
 
 @main.command()
 @click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
-@click.option("--seconds", default=10.0, show_default=True)
+@click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
 @click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
-@click.option("--temperature", default=1.0, show_default=True)
+@click.option("--temperature", default=1.0, show_default=True, help="Above 1 is bolder, below 1 more usual.")
 @click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
 @click.option("--push", default=0.0, help="Push the character at 6.7 s, in m/s.")
-@click.option("--seed", default=0, show_default=True)
-def sample(prior, out, seconds, top_p, temperature, count, push, seed) -> None:
+@option_seed
+def sample(prior, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
     """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics)."""
     from kinetok.evaluate import measure
     from kinetok.gpt.controller import Prior, roll
     from kinetok.motion.clip import Clip
     from kinetok.motion.library import ClipLibrary
 
-    if out.suffix != ".mp4":
-        raise ValueError(f"{out}: the video's name must end in .mp4")
-    model = Prior.from_pretrained(prior)
+    check_suffix(out, ".mp4")
+    model = Prior.from_pretrained(prior, tokenizer)
     character = model.tokenizer.config.character
     recording = roll(model, rows=count, seconds=seconds, top_p=top_p, temperature=temperature, push=push, seed=seed)
     write_motion(out, character, recording.qpos[:, 0], recording.fps, "sample")
@@ -263,8 +293,8 @@ def evaluate() -> None:
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
-@click.option("--threads", default=0)
-@click.option("--seed", default=0, show_default=True)
+@option_threads
+@option_seed
 def evaluate_tracking(tokenizer, paths, out, episodes, push, threads, seed) -> None:
     """Success rate and MPJPE of a tokenizer (or a teacher) on clips, by clip and overall."""
     from kinetok.evaluate import evaluate_tracking as score
@@ -276,26 +306,27 @@ def evaluate_tracking(tokenizer, paths, out, episodes, push, threads, seed) -> N
 
 @evaluate.command("prior")
 @click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
-@click.option("--episodes", default=64, show_default=True)
-@click.option("--seconds", default=20.0, show_default=True)
+@click.option("--episodes", default=64, show_default=True, help="Motions to sample.")
+@click.option("--seconds", default=20.0, show_default=True, help="Length of each; a fall ends it.")
 @click.option("--push", default=0.0, help="Push every character once, at step 200, by so many m/s.")
-@click.option("--top-p", default=0.9, show_default=True)
-@click.option("--threads", default=0)
-@click.option("--seed", default=0, show_default=True)
-def evaluate_prior(prior, out, episodes, seconds, push, top_p, threads, seed) -> None:
+@click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
+@option_threads
+@option_seed
+def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, threads, seed) -> None:
     """Survival, diversity and smoothness of motion sampled from a prior, from random reference states."""
     from kinetok.evaluate import evaluate_prior as score
     from kinetok.gpt.controller import Prior
 
-    model = Prior.from_pretrained(prior)
+    model = Prior.from_pretrained(prior, tokenizer)
     show_json(score(model, episodes=episodes, seconds=seconds, push=push, top_p=top_p, threads=threads, seed=seed), out)
 
 
 @main.command()
 @click.option("--out", default=Path("kinetok-demo"), show_default=True, type=PATHS, help="Folder for the videos.")
-@click.option("--seconds", default=8.0, show_default=True)
-@click.option("--seed", default=0, show_default=True)
+@click.option("--seconds", default=8.0, show_default=True, help="Length of each video.")
+@option_seed
 def demo(out, seconds, seed) -> None:
     """Track a packaged clip, show its tokens, sample new motion; two videos and a table, in under two minutes."""
     from kinetok.demo import run_demo

@@ -5,6 +5,7 @@
 Any leaf is then changed by `--set key=value`.
 """
 
+from kinetok.gpt.pretrain import PretrainConfig
 from kinetok.rl.ppo import PPOConfig
 from kinetok.sim.env import EnvConfig
 from kinetok.tokenizers.distill import DistillStage
@@ -23,12 +24,13 @@ def one_clip() -> FitConfig:
 def many_clips() -> FitConfig:
     """Dozens of motions in hours on two cores: an expert per clip, robust to pushes, and a wider student."""
     return FitConfig(
-        tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=30, levels=9), encoder=(512, 256), decoder=(512, 256)),
+        tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=24, levels=9), encoder=(512, 256), decoder=(512, 256)),
         teacher=PPOStage(
             samples=2_000_000,
             stop_success=1.0,
             stop_mpjpe_mm=30.0,
-            env=EnvConfig(reset_noise=0.02, push=1.0),
+            patience=3,
+            env=EnvConfig(reset_noise=0.02, push=0.5),
         ),
         distill=DistillStage(samples=1_500_000, rows=512, minibatch=2048, memory=262_144, eval_every=150_000,
                              eval_episodes=4, env=EnvConfig(reset_noise=0.02, push=1.0)),
@@ -69,3 +71,23 @@ def tiny() -> FitConfig:
 
 
 FIT = {"one-clip": one_clip, "many-clips": many_clips, "from-scratch": from_scratch, "tiny": tiny}
+
+
+def laptop() -> PretrainConfig:
+    """A prior in a quarter of an hour on two cores."""
+    return PretrainConfig(width=128, layers=3, samples=300_000, iterations=2500, batch=512)
+
+
+def paper() -> PretrainConfig:
+    """GPC's published size (table 10), for a GPU."""
+    return PretrainConfig(width=1024, layers=6, heads=4, samples=20_000_000, iterations=200_000, ema=0.9)
+
+
+def tiny_prior() -> PretrainConfig:
+    """Seconds, for tests."""
+    return PretrainConfig(
+        width=16, layers=1, heads=2, samples=640, rows=32, iterations=20, batch=32, warmup=2, eval_every=10
+    )
+
+
+PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}

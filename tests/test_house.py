@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "kinetok"
 
 GROUND = {"config", "checkpoint", "rotation", "metrics", "logger"}
-FRONT = {"evaluate", "presets", "render"}
+FRONT = {"demo", "evaluate", "presets", "render"}
 BELOW = {
     "ground": set(),
     "motion": {"ground"},

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, load_artifact, require_parent, save_artifact
+from kinetok.checkpoint import CheckpointError, load_artifact, locate, require_parent, save_artifact
 from kinetok.config import from_dict, to_dict
 from kinetok.gpt.data import Starts
 from kinetok.gpt.model import GPT, GPTConfig
@@ -32,12 +32,11 @@ from kinetok.tokenizers.tokenizer import MotionTokenizer
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prior:
-    """gpt, in eval mode; tokenizer: whose tokens it predicts; tokenizer_hash: of that artifact; tokenizer_path: where
-    it was, relative to the prior's directory or absolute; clips: names of what it learned from; starts."""
+    """gpt, in eval mode; tokenizer: whose tokens it predicts, loaded from an artifact; tokenizer_path: where that
+    lies, relative to the prior's directory, or a packaged name; clips: names of what it learned from; starts."""
 
     gpt: GPT
     tokenizer: MotionTokenizer
-    tokenizer_hash: str
     tokenizer_path: str
     clips: tuple[str, ...]
     starts: Starts = field(repr=False)
@@ -66,36 +65,42 @@ class Prior:
             },
             tensors=weights | self.starts.tensors(),
             card=card,
-            parents={"tokenizer": self.tokenizer_hash},
+            parents={"tokenizer": self.tokenizer.hash},
         )
 
     @staticmethod
-    def from_pretrained(path: Path | str, tokenizer: Path | str | None = None) -> "Prior":
-        """Load a prior and its tokenizer: from the directory `tokenizer` if given, else from where it was noted."""
+    def from_pretrained(path: Path | str, tokenizer: MotionTokenizer | Path | str | None = None) -> "Prior":
+        """Load a prior by directory or packaged name, with its tokenizer: `tokenizer`, itself or its directory, if
+        given, else the one at the noted place."""
         artifact = load_artifact(path, kind="prior")
-        place = Path(tokenizer) if tokenizer is not None else _find(Path(path), artifact.config["tokenizer"])
-        parent = load_artifact(place, kind="tokenizer")
-        require_parent(artifact, "tokenizer", parent.hash, place)
+        noted = artifact.config["tokenizer"]
+        if not isinstance(tokenizer, MotionTokenizer):
+            place = _find(artifact.path, noted) if tokenizer is None else locate(tokenizer)
+            tokenizer = MotionTokenizer.from_pretrained(place)
+        else:
+            place = "the tokenizer given"
+        require_parent(artifact, "tokenizer", tokenizer.hash, place)
         gpt = GPT(from_dict(GPTConfig, artifact.config["gpt"]))
         weights = {name[4:]: tensor for name, tensor in artifact.tensors.items() if name.startswith("gpt.")}
         gpt.load_state_dict(weights)
         return Prior(
             gpt=gpt.eval(),
-            tokenizer=MotionTokenizer.from_pretrained(place),
-            tokenizer_hash=parent.hash,
-            tokenizer_path=artifact.config["tokenizer"],
+            tokenizer=tokenizer,
+            tokenizer_path=noted,
             clips=tuple(artifact.config["clips"]),
             starts=Starts.of(artifact.tensors),
         )
 
 
-def relative_path(tokenizer: Path | str, prior: Path | str) -> str:
-    """What a prior notes of its tokenizer's place: the way there from its own directory, so both may be moved."""
-    return Path(os.path.relpath(tokenizer, prior)).as_posix()
+def noted_path(tokenizer: Path | str, prior: Path | str) -> str:
+    """What a prior notes of its tokenizer's place: the way there from its own directory, so that both may be moved
+    together, or the name of a packaged one."""
+    place = Path(tokenizer)
+    return Path(os.path.relpath(place, prior)).as_posix() if place.is_dir() else str(tokenizer)
 
 
 def _find(prior: Path, noted: str) -> Path:
-    for place in (prior / noted, Path(noted)):
+    for place in (prior / noted, locate(noted)):
         if noted and place.is_dir():
             return place
     said = f"its tokenizer is not at {noted!r}" if noted else "it does not say where its tokenizer is"
@@ -141,13 +146,19 @@ class PriorController:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """T control steps of N rows, frame t as it was when tokens t were chosen: qpos (T, N, nq) float64; pos (T, N, B, 3)
-    float32, metres; tokens (T, N, S) int32; blown_up (N,) bool: MuJoCo could not go on and the row began anew; fps."""
+    """T control steps of N rows of a character, frame t as it was when tokens t were chosen.
 
+    qpos (T, N, nq) float64; pos (T, N, B, 3) float32, metres; tokens (T, N, S) int32 below vocabulary; blown_up (N,)
+    bool: MuJoCo could not go on and the row began anew; start (N,): index into the prior's starts; fps.
+    """
+
+    character: str
     qpos: np.ndarray
     pos: np.ndarray
     tokens: np.ndarray
     blown_up: np.ndarray
+    start: np.ndarray
+    vocabulary: int
     fps: int
 
 
@@ -172,7 +183,7 @@ def roll(
     """
     steps = round(seconds * prior.fps)
     if push and push_at >= steps:
-        raise ValueError(f"the push comes at step {push_at}, after the last of {steps} steps; roll longer, or push earlier")
+        raise ValueError(f"the push comes at step {push_at} of {steps}; roll longer than {push_at / prior.fps:.1f} s")
     body = prior.character
     task = Free(body, prior.starts.qpos, prior.starts.qvel, rows=rows, starts=starts)
     config = EnvConfig(scene=prior.tokenizer.config.scene, episode_seconds=seconds + 1)
@@ -185,6 +196,7 @@ def roll(
     tokens = np.empty((steps, rows, prior.gpt.config.tokens_per_step), np.int32)
     blown_up = np.zeros(rows, bool)
     obs = env.reset()
+    drawn = task.drawn.copy()
     with torch_threads(1):
         for t in range(steps):
             qpos[t], pos[t] = env.sim.qpos, env.sim.state().pos
@@ -195,4 +207,13 @@ def roll(
             step = env.step(action.numpy())
             blown_up |= step.terminated
             obs = step.obs
-    return Recording(qpos=qpos, pos=pos, tokens=tokens, blown_up=blown_up, fps=prior.fps)
+    return Recording(
+        character=prior.tokenizer.config.character,
+        qpos=qpos,
+        pos=pos,
+        tokens=tokens,
+        blown_up=blown_up,
+        start=drawn,
+        vocabulary=controller.layout.vocabulary,
+        fps=prior.fps,
+    )

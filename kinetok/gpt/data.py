@@ -15,7 +15,7 @@ it resembles already. This happens at random (`transitions` per second) and, whe
 before a clip ends: the prior learns what follows an end, and how to change from one clip to another.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from kinetok.sim.batch import BodyState
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.train import in_scene
 
 BEFORE_FAILURE = 0.5  # seconds
 REACH = 0.25  # metres of `likeness`; walk to run, or the end of a jump to standing, is about 0.2
@@ -185,10 +186,10 @@ def likeness(body: BodyState) -> np.ndarray:
     return np.concatenate([state[:, :1], pos / bodies**0.5, linear * (GLANCE / bodies**0.5)], axis=1)
 
 
-def moved(
-    qpos: np.ndarray, qvel: np.ndarray, xy: np.ndarray, heading: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same states (n, nq), (n, nv) with the root at xy (n, 2) and turned to heading (n,): physics cannot tell.
+def moved(qpos: np.ndarray, qvel: np.ndarray, xy: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same states (n, nq), (n, nv) with the root at xy (n, 2) and turned to heading (n,).
+
+    Physics cannot tell, but for the scene's friction pyramid, whose corners keep their directions in the world.
 
     Of a free joint's velocity the linear part is in the world frame and turns along, the angular part is local.
     """
@@ -244,7 +245,7 @@ def record(
     rng = np.random.default_rng([seed, 1])
     tracking = TrackingConfig(future=tokenizer.config.future)
     task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng)
-    world = Env(replace(env or EnvConfig(), scene=scene), task, rows=rows, threads=threads, seed=seed)
+    world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part = -(-samples // rows), task.layout["state"]
     states = torch.empty(steps, rows, part.stop - part.start)
     tokens = torch.empty(steps, rows, layout.tokens_per_step, dtype=torch.int32)

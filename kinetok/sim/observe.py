@@ -14,7 +14,7 @@ import numpy as np
 from einops import rearrange
 
 from kinetok import rotation
-from kinetok.sim.batch import BodyState, cross
+from kinetok.sim.batch import BodyState
 
 
 def state_size(bodies: int) -> int:
@@ -29,10 +29,19 @@ def error_size(bodies: int) -> int:
     return bodies * 12
 
 
-def _unyaw(vectors: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """World vectors (N, K, 3) seen from the heading of root quaternions (N, 4)."""
+def _seen_(out: np.ndarray, parts: list[np.ndarray], quat: np.ndarray) -> None:
+    """World vectors, parts of (N, k, 3), seen from the heading of root quaternions (N, 4), written to out (N, 3 K)."""
     angle = rotation.heading(quat)
-    return rotation.turn(vectors, np.cos(angle)[:, None], -np.sin(angle)[:, None])
+    cos, sin = np.cos(angle)[:, None], -np.sin(angle)[:, None]
+    vectors, start = out.reshape(len(out), -1, 3), 0
+    for part in parts:
+        stop = start + part.shape[1]
+        rotation.turn(part, cos, sin, out=vectors[:, start:stop])
+        start = stop
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("nbk,nbk->nb", a, b)
 
 
 def _columns(mat: np.ndarray) -> np.ndarray:
@@ -40,43 +49,62 @@ def _columns(mat: np.ndarray) -> np.ndarray:
     return rearrange(mat[..., :2], "n b x c -> n (b c) x")
 
 
-def state_features(body: BodyState) -> np.ndarray:
-    """Proprioception (N, state_size): height, positions, 6-D orientations, linear and angular velocities."""
-    vectors = np.concatenate([body.pos[:, 1:] - body.pos[:, :1], _columns(body.mat), body.linear, body.angular], axis=1)
-    return np.concatenate([body.pos[:, 0, 2:], _unyaw(vectors, body.quat).reshape(len(vectors), -1)], axis=1)
+def state_features(body: BodyState, out: np.ndarray | None = None) -> np.ndarray:
+    """Proprioception (N, state_size): height, positions, 6-D orientations, linear and angular velocities.
+
+    Like the other features here, it is written to `out` where that is given: a slice of an observation.
+    """
+    rows, bodies = body.pos.shape[:2]
+    out = np.empty((rows, state_size(bodies)), dtype=np.float32) if out is None else out
+    out[:, 0] = body.pos[:, 0, 2]
+    parts = [body.pos[:, 1:] - body.pos[:, :1], _columns(body.mat), body.linear, body.angular]
+    _seen_(out[:, 1:], parts, body.quat)
+    return out
 
 
 def pose_features(pos: np.ndarray, mat: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """What a reference frame shows of itself (F, (B - 1) * 3 + B * 6), in its own heading frame: computed once."""
-    vectors = np.concatenate([pos[:, 1:] - pos[:, :1], _columns(mat)], axis=1)
-    return _unyaw(vectors, quat).reshape(len(vectors), -1)
+    frames, bodies = pos.shape[:2]
+    out = np.empty((frames, (bodies - 1) * 3 + bodies * 6), dtype=np.float32)
+    _seen_(out, [pos[:, 1:] - pos[:, :1], _columns(mat)], quat)
+    return out
 
 
-def window_features(body: BodyState, pose: np.ndarray, root: np.ndarray, heading: np.ndarray) -> np.ndarray:
+def window_features(
+    body: BodyState, pose: np.ndarray, root: np.ndarray, heading: np.ndarray, out: np.ndarray | None = None
+) -> np.ndarray:
     """Future frames relative to the body (N, window_size).
 
     pose (N, F, P) from pose_features; root (N, F, 3) reference root positions; heading (N, F) radians.
     Each frame adds its root offset in the body's heading frame, its height and its relative heading.
     """
+    rows, frames, width = pose.shape
+    out = np.empty((rows, frames * (width + 6)), dtype=np.float32) if out is None else out
+    window = out.reshape(rows, frames, width + 6)
     angle = rotation.heading(body.quat)
-    offset = rotation.turn(root - body.pos[:, :1], np.cos(angle)[:, None], -np.sin(angle)[:, None])
+    window[..., :width] = pose
+    offset = window[..., width : width + 3]
+    rotation.turn(root - body.pos[:, :1], np.cos(angle)[:, None], -np.sin(angle)[:, None], out=offset)
     relative = heading - angle[:, None]
-    extra = np.stack([root[..., 2], np.cos(relative), np.sin(relative)], axis=-1)
-    return np.concatenate([pose, offset, extra], axis=-1).reshape(len(pose), -1)
+    window[..., width + 3] = root[..., 2]
+    window[..., width + 4] = np.cos(relative)
+    window[..., width + 5] = np.sin(relative)
+    return out
 
 
-def error_features(body: BodyState, reference: BodyState) -> np.ndarray:
+def error_features(body: BodyState, reference: BodyState, out: np.ndarray | None = None) -> np.ndarray:
     """Tracking error now (N, error_size): position, rotation (sine of the angle times its axis) and velocities."""
-    twist = cross(
-        np.ascontiguousarray(np.swapaxes(body.mat, -1, -2)), np.ascontiguousarray(np.swapaxes(reference.mat, -1, -2))
-    ).sum(-2)
-    vectors = np.concatenate(
-        [
-            reference.pos - body.pos,
-            twist / 2,
-            (reference.linear - body.linear) * 0.1,
-            (reference.angular - body.angular) * 0.1,
-        ],
-        axis=1,
-    )
-    return _unyaw(vectors, body.quat).reshape(len(vectors), -1)
+    rows, bodies = body.pos.shape[:2]
+    out = np.empty((rows, error_size(bodies)), dtype=np.float32) if out is None else out
+    twist = np.empty_like(body.pos)  # skew part of R R_ref^T, row times row
+    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        twist[..., axis] = _dot(body.mat[..., i, :], reference.mat[..., j, :])
+        twist[..., axis] -= _dot(body.mat[..., j, :], reference.mat[..., i, :])
+    parts = [
+        reference.pos - body.pos,
+        twist / 2,
+        (reference.linear - body.linear) * 0.1,
+        (reference.angular - body.angular) * 0.1,
+    ]
+    _seen_(out, parts, body.quat)
+    return out

@@ -23,11 +23,17 @@ class TrackingReward:
 
 def tracking_errors(body: BodyState, reference: BodyState) -> dict[str, np.ndarray]:
     """Mean square errors (N,) by term. The squared angle is 3 - tr(R^T R_ref), equal to second order."""
+    bodies = body.mat.shape[1]
+
+    def square(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        difference = a - b
+        return np.einsum("nbi,nbi->n", difference, difference) / bodies
+
     return {
-        "position": ((body.pos - reference.pos) ** 2).sum(-1).mean(-1),
-        "rotation": 3 - np.einsum("nbij,nbij->n", body.mat, reference.mat) / body.mat.shape[1],
-        "linear": ((body.linear - reference.linear) ** 2).sum(-1).mean(-1),
-        "angular": ((body.angular - reference.angular) ** 2).sum(-1).mean(-1),
+        "position": square(body.pos, reference.pos),
+        "rotation": 3 - np.einsum("nbij,nbij->n", body.mat, reference.mat) / bodies,
+        "linear": square(body.linear, reference.linear),
+        "angular": square(body.angular, reference.angular),
         "height": (body.pos[:, 0, 2] - reference.pos[:, 0, 2]) ** 2,
     }
 

@@ -26,6 +26,11 @@ class SceneConfig:
 
 def build_scene(character: Character, config: SceneConfig) -> mujoco.MjModel:
     """Compile the character on a floor."""
+    return scene_spec(character, config).compile()
+
+
+def scene_spec(character: Character, config: SceneConfig) -> mujoco.MjSpec:
+    """The character on a floor, before it is compiled: the place to add to it."""
     spec = mujoco.MjSpec.from_string(character.xml)
     spec.modelname = f"kinetok-{character.name}"
     option = spec.option
@@ -40,7 +45,7 @@ def build_scene(character: Character, config: SceneConfig) -> mujoco.MjModel:
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     _floor(spec, config.friction)
     spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    return spec.compile()
+    return spec
 
 
 def _floor(spec: mujoco.MjSpec, friction: float) -> None:
@@ -60,6 +65,7 @@ def _floor(spec: mujoco.MjSpec, friction: float) -> None:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[0, 0, 1],
         material="floor",
+        rgba=[1, 1, 1, 1],  # not the colour of the character's default class
         friction=np.array([friction, 0.05, 0.05]),
         contype=1,
         conaffinity=1,

@@ -78,7 +78,11 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
     if clip.character != config.character:
         raise ConfigError(f"clip {clip.name!r} is of {clip.character!r}, the tokenizer of {config.character!r}")
     layout = tokenizer.layout
-    seconds = seconds or clip.seconds
+    seconds = clip.seconds if seconds is None else seconds
+    if not seconds * config.scene.control_hz >= 1 - 1e-6:
+        raise ValueError(
+            f"{seconds:g} seconds of clip {clip.name!r} hold no control step of 1/{config.scene.control_hz} s"
+        )
     table = ReferenceTable(ClipLibrary.of([clip]), control_hz=config.scene.control_hz, seconds=seconds + 1)
     tracking = TrackingConfig(future=config.future, fail_max=np.inf, fail_mean=0.5)
     task = Tracking(tracking, table, rows=1, starts=np.zeros(1, dtype=int))
@@ -109,10 +113,18 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
 
 
 def decode_tokens(tokenizer: MotionTokenizer, stream: TokenStream) -> np.ndarray:
-    """Poses (T + 1, nq) of the character that plays a stream's tokens in simulation from the stream's state."""
+    """Poses (T + 1, nq) of the character that plays a stream's tokens in simulation from the stream's state.
+
+    Raises ConfigError where another tokenizer wrote the stream: the same tokens would mean another motion.
+    """
     if stream.layout != tokenizer.layout:
         raise ConfigError(
             f"the tokens have {stream.layout}, the tokenizer has {tokenizer.layout}; use its own tokenizer"
+        )
+    if stream.tokenizer != tokenizer.hash:
+        raise ConfigError(
+            f"the tokens of {stream.name!r} were written by tokenizer {stream.tokenizer[:12] or '(unsaved)'}, this is "
+            f"{tokenizer.hash[:12] or '(unsaved)'}; use the tokenizer that wrote them"
         )
     character = Character.load(tokenizer.config.character)
     sim = BatchSim(build_scene(character, tokenizer.config.scene), 1, 1)

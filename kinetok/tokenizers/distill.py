@@ -16,20 +16,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
-from kinetok.config import diff, to_dict
+from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.track import TrackingScore, track
+from kinetok.tokenizers.train import identify, in_scene, refuse_changed
 
 
 @dataclass(frozen=True, kw_only=True)
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
-    memory: labelled states kept; noise: radians added to the student's targets while it acts."""
+    memory: labelled states kept; noise: radians added to the student's targets while it acts; save_every: samples
+    between states to resume from (the memory starts anew there, so not too often)."""
 
     samples: int = 200_000
     rows: int = 256
@@ -42,6 +43,7 @@ class DistillStage:
     fail_mean: float = 0.3
     eval_every: int = 50_000
     eval_episodes: int = 16
+    save_every: int = 400_000
     env: EnvConfig = EnvConfig(reset_noise=0.01)
 
 
@@ -63,39 +65,30 @@ def distill(
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
     task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
-    env = Env(config.env, task, rows=config.rows, threads=threads, seed=seed)
+    env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     views = [_View(teacher, task) for teacher in teachers]
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
-    identity = {
-        "stage": to_dict(config),
-        "tokenizer": to_dict(student.config),
-        "seed": seed,
-        "clips": list(table.names),
-    }
+    identity = identify(config, student.config, table.names, seed)
     path = out / "state.safetensors"
-    step = evaluated = 0
-    best_merit, best = -1e9, None
+    step = evaluated = saved = 0
+    best: TrackingScore | None = None
     memory = torch.empty(config.memory, env.obs_size)
     labels = torch.empty(config.memory, env.action_size)
     if path.exists():
         tensors, meta = load_state(path)
-        changed = diff(meta["identity"], identity)
-        if changed:
-            raise CheckpointError(
-                f"{path}: started with another configuration: {'; '.join(changed)}; choose another --out"
-            )
+        refuse_changed(path, meta["identity"], identity, DistillStage)
         tree = unflatten(tensors, meta["tree"])
         student.load_state_dict(tree["student"])
         optimizer.load_state_dict(tree["optimizer"])
         generator.set_state(tree["generator"])
         env.load_state_dict(json.loads(meta["env"]))
-        step, best_merit = meta["step"], meta["best"]
-        evaluated = step * config.rows
+        step, best = meta["step"], meta.get("score") and TrackingScore.from_json(meta["score"])
+        evaluated = saved = step * config.rows
     # The memory is filled anew after every save, so that a resumed run and an unbroken one are the same.
     filled = cursor = 0
     total = config.samples // config.rows
-    with Logger(out, total=config.samples, title="distill", start=step * config.rows, quiet=quiet) as log:
+    with Logger(out, total=config.samples, title="distill", start=(step + 1) * config.rows, quiet=quiet) as log:
         obs = torch.from_numpy(env.reset(spread=True))
         while step < total:
             with torch.no_grad(), torch_threads(1):
@@ -123,9 +116,13 @@ def distill(
                     student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
                 )
                 metrics |= {f"track/{k}": v for k, v in score.summary().items()} | env.episode_metrics()
-                if score.merit > best_merit:
-                    best_merit, best = score.merit, score
+                if best is None or score.merit > best.merit:
+                    best = score
                     student.save_pretrained(out, card(score), parents)
+            if metrics:
+                log.write(samples, metrics)
+            if samples - saved >= config.save_every or step == total:
+                saved = samples
                 tensors, skeleton = flatten(
                     {
                         "student": dict(student.state_dict()),
@@ -133,12 +130,10 @@ def distill(
                         "generator": generator.get_state(),
                     }
                 )
-                meta = {"tree": skeleton, "identity": identity, "step": step, "best": best_merit}
+                meta = {"tree": skeleton, "identity": identity, "step": step, "score": best and best.to_json()}
                 save_state(path, tensors, meta | {"env": json.dumps(env.state_dict())})
                 obs = torch.from_numpy(env.reset(spread=True))
                 filled = cursor = 0
-            if metrics:
-                log.write(samples, metrics)
     student.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())
     return best or track(student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
 

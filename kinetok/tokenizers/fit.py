@@ -12,7 +12,6 @@ they train side by side, one core each; the result does not depend on how many d
 """
 
 import multiprocessing
-import shutil
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -21,18 +20,19 @@ from pathlib import Path
 
 import torch
 
-from kinetok.checkpoint import load_artifact
+from kinetok.checkpoint import load_artifact, load_state, refuse_foreign, save_artifact
 from kinetok.config import ConfigError, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.ppo import PPOConfig
+from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.distill import DistillStage, distill
 from kinetok.tokenizers.quantizer import ContinuousConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore
-from kinetok.tokenizers.train import PPOStage, train_ppo
+from kinetok.tokenizers.train import PPOStage, identify, in_scene, refuse_changed, train_ppo
 
 STAGES = ("teacher", "distill", "ppo")
 
@@ -75,6 +75,8 @@ class FitConfig:
         for stage in self.stages:
             if stage not in STAGES:
                 raise ConfigError(f"unknown stage {stage!r}{nearest(stage, STAGES)}; stages: {', '.join(STAGES)}")
+        for stage in (self.teacher, self.distill, self.ppo):
+            in_scene(stage.env, self.tokenizer.scene)
         missing = set(self.teacher_tokenizer.future) - set(self.tokenizer.future)
         if missing:
             raise ConfigError(
@@ -101,18 +103,31 @@ def new_tokenizer(config: TokenizerConfig, table: ReferenceTable, seed: int) -> 
 
 def fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int = 0, threads: int = 0) -> MotionTokenizer:
     """Run the stages that are not finished yet and write the best tokenizer to `out`."""
+    with torch_threads(threads or torch.get_num_threads()):
+        return _fit(clips, config, out, seed=seed, threads=threads)
+
+
+def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> MotionTokenizer:
     library = ClipLibrary.of(clips)
+    if library.character != config.tokenizer.character:
+        raise ConfigError(
+            f"the clips are of {library.character!r}, tokenizer.character is {config.tokenizer.character!r}; "
+            f"set tokenizer.character={library.character}"
+        )
     names = [clip.name for clip in clips]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ConfigError(f"two clips are named {twice!r}; rename a file, the name says which teacher is whose")
+    table = ReferenceTable(library, control_hz=config.tokenizer.scene.control_hz)
+    student = new_tokenizer(config.tokenizer, table, seed)
+    if student.quantizer.levels:
+        student.layout  # noqa: B018  refuses codes that do not divide into tokens, before hours of training
+    refuse_foreign(out)
     out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     scores: dict[str, TrackingScore] = {}
     if "teacher" in config.stages:
         train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
-    table = ReferenceTable(library, control_hz=config.tokenizer.scene.control_hz)
-    student = new_tokenizer(config.tokenizer, table, seed)
     story: list[str] = ["teacher"] if "teacher" in config.stages else []
     if "distill" in config.stages:
         teachers = [MotionTokenizer.from_pretrained(out / "teachers" / name) for name in names]
@@ -145,15 +160,26 @@ def fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int = 0, t
     if not scores:
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
     best = max(scores, key=lambda stage: scores[stage].merit)
-    for name in ("model.safetensors", "README.md", "config.json"):
-        shutil.copyfile(out / best / name, out / f".{name}.tmp")
-        (out / f".{name}.tmp").replace(out / name)
+    artifact = load_artifact(out / best)
+    save_artifact(
+        out,
+        kind=artifact.kind,
+        config=artifact.config,
+        tensors=artifact.tensors,
+        card=(artifact.path / "README.md").read_text(encoding="utf-8"),
+        parents=artifact.parents,
+    )
     print(f"best stage: {best}; {scores[best].summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
     return MotionTokenizer.from_pretrained(out)
 
 
 def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
     """One expert per clip, `config.workers` at a time on one core each; finished ones are left alone."""
+    for clip in clips:
+        state = out / clip.name / "state.safetensors"
+        if state.exists():
+            identity = identify(config.teacher, _settings(config), [clip.name], seed)
+            refuse_changed(state, load_state(state)[1]["identity"], identity, PPOStage)
     jobs = [(clip, config, out / clip.name, seed) for clip in clips if not (out / clip.name / "done").exists()]
     if len(jobs) <= 1 or config.workers <= 1:
         for job in jobs:
@@ -162,7 +188,11 @@ def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(config.workers, mp_context=context) as pool:
         running = {pool.submit(_teach, *job, threads=1, quiet=True): job[0].name for job in jobs}
-        _report(running, len(jobs))
+        try:
+            _report(running, len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _report(running: dict, total: int) -> None:
@@ -171,10 +201,15 @@ def _report(running: dict, total: int) -> None:
         print(f"teacher {count}/{total} {running[future]}: {future.result()}", flush=True)
 
 
+def _settings(config: FitConfig) -> TokenizerConfig:
+    """The teachers' own, in the student's body and physics."""
+    return replace(config.teacher_tokenizer, character=config.tokenizer.character, scene=config.tokenizer.scene)
+
+
 def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool) -> str:
     if threads:
         torch.set_num_threads(threads)
-    settings = replace(config.teacher_tokenizer, scene=config.tokenizer.scene)
+    settings = _settings(config)
     table = ReferenceTable(ClipLibrary.of([clip]), control_hz=settings.scene.control_hz)
     teacher = new_tokenizer(settings, table, seed)
     score = train_ppo(

@@ -48,6 +48,15 @@ class TrackingScore:
             "seconds": float(self.seconds.mean()),
         }
 
+    def to_json(self) -> dict:
+        """Lists and numbers, exact; `from_json` reads them."""
+        return {key: value if key == "episodes" else np.asarray(value).tolist() for key, value in vars(self).items()}
+
+    @staticmethod
+    def from_json(data: dict) -> "TrackingScore":
+        arrays = {key: np.array(value) for key, value in data.items() if key not in ("names", "episodes")}
+        return TrackingScore(names=tuple(data["names"]), episodes=data["episodes"], **arrays)
+
 
 def track(
     actor: Actor,

@@ -13,30 +13,32 @@ A loss that is not finite stops the run, keeps the last good state and dumps the
 
 import copy
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
-from kinetok.config import diff, to_dict
+from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.logger import Logger
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
 from kinetok.rl.rollout import Rollout, collect
 from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
-from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore, track
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPOStage:
     """samples: control steps to train for; rows: worlds; eval_every: samples between evaluations of `eval_episodes`
-    episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; critic_warmup: first
+    episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; patience: or when, with
+    stop_success reached, the best score is so many evaluations old; critic_warmup: first
     iterations that leave the policy alone; fail_mean: training's termination, metres of mean body error."""
 
     samples: int = 2_000_000
@@ -45,6 +47,7 @@ class PPOStage:
     eval_episodes: int = 16
     stop_success: float = 2.0
     stop_mpjpe_mm: float = 0.0
+    patience: int = 1000
     critic: tuple[int, ...] = (256, 128)
     critic_warmup: int = 0
     fail_mean: float = 0.3
@@ -54,12 +57,27 @@ class PPOStage:
 
 @dataclass
 class Progress:
-    """What a run knows of itself besides its tensors."""
+    """What a run knows of itself besides its tensors. best, score: merit and score of the artifact that was kept;
+    stale: evaluations since."""
 
     iteration: int = 0
     samples: int = 0
     evaluated: int = 0
     best: float = -1e9
+    stale: int = 0
+    score: TrackingScore | None = None
+
+    def finished(self, config: PPOStage) -> bool:
+        good = self.score is not None and _good_enough(self.score, self.stale, config)
+        return good or self.samples >= config.samples
+
+    def to_json(self) -> dict:
+        return vars(self) | {"score": self.score and self.score.to_json()}
+
+    @staticmethod
+    def from_json(data: dict) -> "Progress":
+        score = data.get("score")
+        return Progress(**data | {"score": score and TrackingScore.from_json(score)})
 
 
 def train_ppo(
@@ -77,29 +95,30 @@ def train_ppo(
     """Train `actor` in place; returns the score of the best artifact, which lies in `out`."""
     future, scene = actor.config.future, actor.config.scene
     task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
-    env = Env(config.env, task, rows=config.rows, threads=threads, seed=seed)
+    env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     torch.manual_seed(seed)
     critic = Critic(env.obs_size, config.critic, actor.config.activation)
     optimizers = Optimizers(actor, critic, config.ppo)
     generator = torch.Generator().manual_seed(seed)
     anchor = copy.deepcopy(actor) if config.ppo.anchor else None
-    run = _Run(out, actor, critic, optimizers, generator, env, anchor, config, seed)
+    identity = identify(config, actor.config, table.names, seed)
+    run = _Run(out, actor, critic, optimizers, generator, env, anchor, identity)
     progress = run.resume()
 
     def evaluate() -> TrackingScore:
         return track(actor, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
 
-    best: TrackingScore | None = None
     per_iteration = config.rows * config.ppo.horizon
-    with Logger(out, total=config.samples, title=title, start=progress.samples, quiet=quiet) as log:
+    start = progress.samples + per_iteration
+    with Logger(out, total=config.samples, title=title, start=start, quiet=quiet) as log:
         obs = torch.from_numpy(env.reset(spread=True))
-        while progress.samples < config.samples:
+        while not progress.finished(config):
             share = min(progress.samples / config.samples, 1.0)
             log_std = config.ppo.log_std[0] + share * (config.ppo.log_std[1] - config.ppo.log_std[0])
             rollout = collect(env, actor, critic, obs, horizon=config.ppo.horizon, log_std=log_std, generator=generator)
             obs = rollout.last_obs
             if progress.iteration > 0:
-                metrics = _learn(run, rollout, log_std, progress.iteration > config.critic_warmup)
+                metrics = _learn(run, rollout, config.ppo, log_std, progress.iteration > config.critic_warmup)
             else:
                 metrics = {}  # the first rollout only sets the normalisers
             if not (progress.iteration == 0 and float(actor.norm.count) > 0):
@@ -107,35 +126,60 @@ def train_ppo(
             critic.observe(rollout.obs)
             progress.iteration += 1
             progress.samples += per_iteration
-            if progress.samples >= progress.evaluated + config.eval_every or progress.samples >= config.samples:
+            due = progress.samples >= min(progress.evaluated + config.eval_every, config.samples)
+            if due:
                 progress.evaluated = progress.samples
                 score = evaluate()
                 metrics |= {f"track/{k}": v for k, v in score.summary().items()}
+                progress.stale += 1
                 if score.merit > progress.best:
-                    progress.best, best = score.merit, score
+                    progress.best, progress.stale, progress.score = score.merit, 0, score
                     actor.save_pretrained(out, card(score))
+            log.write(progress.samples, metrics | env.episode_metrics())
+            if due:
                 run.save(progress)
                 obs = torch.from_numpy(env.reset(spread=True))
-            log.write(progress.samples, metrics | env.episode_metrics())
-            if best is not None and "track/success" in metrics and _good_enough(best, config):
-                break
-    if best is None:
-        best = evaluate()
     actor.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())
-    return best
+    return progress.score or evaluate()
 
 
-def _good_enough(score: TrackingScore, config: PPOStage) -> bool:
-    return score.success.mean() >= config.stop_success and score.mpjpe_mm.mean() <= config.stop_mpjpe_mm
+def in_scene(env: EnvConfig, scene: SceneConfig) -> EnvConfig:
+    """A stage's world with the tokenizer's physics; refuses a stage that sets another one."""
+    changed = diff(scene, env.scene)
+    if env.scene != SceneConfig() and changed:
+        raise ConfigError(f"a stage's env.scene differs from tokenizer.scene ({'; '.join(changed)}); set the latter")
+    return replace(env, scene=scene)
+
+
+def identify(config: object, tokenizer: TokenizerConfig, names: Sequence[str], seed: int) -> dict:
+    """What a run is, for `refuse_changed`: a state goes on only under the same."""
+    return {"stage": to_dict(config), "tokenizer": to_dict(tokenizer), "seed": seed, "clips": list(names)}
+
+
+def refuse_changed(path: Path, old: dict, new: dict, stage: type) -> None:
+    """Raise CheckpointError where the state at `path` is of another run; settings it does not know had the default."""
+    old = {"clips": new["clips"]} | old
+    old |= {k: to_dict(from_dict(t, old[k])) for k, t in (("stage", stage), ("tokenizer", TokenizerConfig))}
+    changed = diff(old, new)
+    if changed:
+        raise CheckpointError(
+            f"{path}: this run was started with another configuration: {'; '.join(changed)}. "
+            "Repeat the old settings to go on, or choose another --out"
+        )
+
+
+def _good_enough(best: TrackingScore, stale: int, config: PPOStage) -> bool:
+    if best.success.mean() < config.stop_success:
+        return False
+    return best.mpjpe_mm.mean() <= config.stop_mpjpe_mm or stale >= config.patience
 
 
 class _Run:
     """The mutable parts of one training, saved and restored together."""
 
-    def __init__(self, out, actor, critic, optimizers, generator, env, anchor, config: PPOStage, seed: int):
+    def __init__(self, out, actor, critic, optimizers, generator, env, anchor, identity: dict):
         self.out, self.actor, self.critic, self.optimizers = out, actor, critic, optimizers
-        self.generator, self.env, self.anchor, self.config = generator, env, anchor, config
-        self.identity = {"stage": to_dict(config), "tokenizer": to_dict(actor.config), "seed": seed}
+        self.generator, self.env, self.anchor, self.identity = generator, env, anchor, identity
 
     @property
     def path(self) -> Path:
@@ -152,19 +196,14 @@ class _Run:
 
     def save(self, progress: Progress) -> None:
         tensors, skeleton = flatten(self._tree())
-        meta = {"tree": skeleton, "identity": self.identity, "progress": vars(progress)}
+        meta = {"tree": skeleton, "identity": self.identity, "progress": progress.to_json()}
         save_state(self.path, tensors, meta | {"env": json.dumps(self.env.state_dict())})
 
     def resume(self) -> Progress:
         if not self.path.exists():
             return Progress()
         tensors, meta = load_state(self.path)
-        changed = diff(meta["identity"], self.identity)
-        if changed:
-            raise CheckpointError(
-                f"{self.path}: this run was started with another configuration: {'; '.join(changed)}. "
-                "Repeat the old settings to go on, or choose another --out"
-            )
+        refuse_changed(self.path, meta["identity"], self.identity, PPOStage)
         tree = unflatten(tensors, meta["tree"])
         self.actor.load_state_dict(tree["actor"])
         self.critic.load_state_dict(tree["critic"])
@@ -173,11 +212,10 @@ class _Run:
         if self.anchor is not None:
             self.anchor.load_state_dict(tree["anchor"])
         self.env.load_state_dict(json.loads(meta["env"]))
-        return Progress(**meta["progress"])
+        return Progress.from_json(meta["progress"])
 
 
-def _learn(run: _Run, rollout: Rollout, log_std: float, train_actor: bool) -> dict[str, float]:
-    config = run.config.ppo
+def _learn(run: _Run, rollout: Rollout, config: PPOConfig, log_std: float, train_actor: bool) -> dict[str, float]:
     try:
         advantages, targets = gae(
             rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
@@ -195,6 +233,10 @@ def _learn(run: _Run, rollout: Rollout, log_std: float, train_actor: bool) -> di
             train_actor=train_actor,
             anchor=run.anchor,
         )
+        # The last minibatch's gradient has no later loss that would show it.
+        finite = [torch.isfinite(p).all() for net in (run.actor, run.critic) for p in net.parameters()]
+        if not (np.isfinite(list(metrics.values())).all() and torch.stack(finite).all()):
+            raise FloatingPointError(f"parameters or metrics are not finite: {metrics}")
     except FloatingPointError as error:
         dump = run.out / "bad_rollout.safetensors"
         save_state(dump, {"obs": rollout.obs, "actions": rollout.actions, "rewards": rollout.rewards}, {})
@@ -202,8 +244,6 @@ def _learn(run: _Run, rollout: Rollout, log_std: float, train_actor: bool) -> di
             f"{error}; training stopped. The rollout is in {dump}; the last good state in {run.path} is untouched. "
             "Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
         ) from error
-    if not np.isfinite(list(metrics.values())).all():
-        raise FloatingPointError(f"metrics are not finite: {metrics}; the last good state is {run.path}")
     metrics["failed_simulations"] = run.env.failed_simulations
     metrics["log_std"] = log_std
     return metrics

@@ -110,9 +110,7 @@ def test_load_from_a_path_with_roles_beside_it(tmp_path):
 
 
 def test_load_messages(tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"unknown character 'humanoit'.*path of an MJCF file ending in \.xml"
-    ):
+    with pytest.raises(ConfigError, match=r"unknown character 'humanoit'.*path of an MJCF file ending in \.xml"):
         Character.load("humanoit")
     with pytest.raises(FileNotFoundError, match=r"none\.xml: no such MJCF file"):
         Character.load(str(tmp_path / "none.xml"))

@@ -65,7 +65,8 @@ def test_body_state_is_fresh_and_mujocos_own(scene):
 
 
 @pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e12])
-def test_a_blown_up_row_is_reported_and_contained(scene, velocity):
+def test_a_blown_up_row_is_reported_and_contained(scene, velocity, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log file where it stands
     qpos, qvel, ctrl = start(scene)
     good, bad = BatchSim(scene, ROWS, 2), BatchSim(scene, ROWS, 2)
     for sim in (good, bad):
@@ -114,3 +115,14 @@ def test_friction_of_the_floor_counts(scene):
 def test_cross():
     a, b = np.random.default_rng(0).normal(size=(2, 7, 5, 3))
     np.testing.assert_allclose(cross(a, b), np.cross(a, b))
+
+
+def test_set_state_forgets_what_the_row_did_before(scene):
+    qpos, qvel, ctrl = start(scene)
+    fresh, used = BatchSim(scene, ROWS, 1), BatchSim(scene, ROWS, 1)
+    for step in ctrl:
+        used.step(step, SUBSTEPS)
+    for sim in (fresh, used):
+        sim.set_state(np.arange(ROWS), qpos, qvel)
+        sim.step(ctrl[0], SUBSTEPS)
+    np.testing.assert_array_equal(used.qvel, fresh.qvel)

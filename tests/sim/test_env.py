@@ -108,7 +108,8 @@ def test_random_pushes_come_as_often_as_asked(table):
     assert hits / 600 == pytest.approx(1 / 15, abs=0.04)
 
 
-def test_a_failed_simulation_is_reset_counted_and_contained(table):
+def test_a_failed_simulation_is_reset_counted_and_contained(table, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log file where it stands
     good, bad = (make(table, loose=True, **pinned(0, 3)) for _ in range(2))
     for env in (good, bad):
         env.reset()

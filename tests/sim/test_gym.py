@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from kinetok.sim.gym import TrackingVectorEnv
 from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
 
 ROWS = 4
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -91,5 +93,5 @@ def test_messages(worlds):
 
 def test_without_gymnasium_the_message_names_the_extra():
     code = "import sys; sys.modules['gymnasium'] = None; import kinetok.sim.gym"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert "ImportError: kinetok.sim.gym needs Gymnasium: pip install 'kinetok[gym]'" in result.stderr

@@ -94,3 +94,13 @@ def test_rotation_error_is_sine_times_axis():
     got = observe.error_features(state(zero, identity, zero, zero, quat), state(zero, turned, zero, zero, quat))
     angle = np.linalg.norm(vector)
     np.testing.assert_allclose(got[:, B * 3 : B * 6].reshape(N, B, 3)[0, 0], np.sin(angle) * vector / angle, atol=1e-6)
+
+
+def test_written_into_a_slice_of_an_observation():
+    a, b = body(0), body(1)
+    obs = np.full((N, 300), 7.0, dtype=np.float32)
+    observe.state_features(a, obs[:, 3 : 3 + observe.state_size(B)])
+    observe.error_features(a, b, obs[:, 100 : 100 + observe.error_size(B)])
+    np.testing.assert_array_equal(obs[:, 3:61], observe.state_features(a)[:, :58])
+    np.testing.assert_array_equal(obs[:, 100:148], observe.error_features(a, b))
+    assert (obs[:, :3] == 7).all() and (obs[:, 61:100] == 7).all() and (obs[:, 148:] == 7).all()

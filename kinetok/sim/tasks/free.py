@@ -59,8 +59,9 @@ class Free:
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
         """terminated: the state is not a number. truncated: never; the time limit is the environment's."""
-        fine = np.isfinite(body.pos).all((1, 2)) & np.isfinite(body.linear).all((1, 2))
-        return ~fine, np.zeros(len(fine), dtype=bool)
+        numbers = np.concatenate([body.pos, body.linear], axis=1)
+        fine = np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)
+        return np.logical_not(fine), np.zeros(len(numbers), dtype=bool)
 
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
         """Nothing to learn from an episode."""

@@ -130,13 +130,13 @@ class Tracking:
         if ids is not None:
             frame, last = frame[ids], last[ids]
         ahead = np.minimum(frame[:, None] + self._future, last[:, None])
-        parts = [
-            observe.state_features(body),
-            observe.window_features(body, table.pose[ahead], table.root[ahead], table.heading[ahead]),
-            observe.error_features(body, table.body.rows(frame)),
-            table.target[np.minimum(frame + 1, last)],
-        ]
-        return np.concatenate(parts, axis=1)
+        obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
+        part = {name: obs[:, columns] for name, columns in self.layout.items()}
+        observe.state_features(body, part["state"])
+        observe.window_features(body, table.pose[ahead], table.root[ahead], table.heading[ahead], part["window"])
+        observe.error_features(body, table.body.rows(frame), part["error"])
+        part["target"][:] = table.target[np.minimum(frame + 1, last)]
+        return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """GPC eq. 8 against the frame the row should have reached."""
@@ -148,7 +148,8 @@ class Tracking:
 
         `error` keeps every body's distance (N, B) in metres from the reference, as it was before any reset.
         """
-        self.error = np.sqrt(((body.pos - self.table.body.pos[self.frame]) ** 2).sum(-1))
+        offset = body.pos - self.table.body.pos[self.frame]
+        self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
         fine = (self.error.max(1) < self.config.fail_max) & (self.error.mean(1) < self.config.fail_mean)
         return ~fine, self.frame >= self.table.last[self.clip]
 

@@ -1,0 +1,129 @@
+"""Benchmarks: each prints ratios measured in one run, on the machine it runs on.
+
+    python benchmarks/run.py                       # all of them
+    python benchmarks/run.py env_step --json out.json
+
+A benchmark is a function (clip path) -> dict of plain numbers, registered in BENCHMARKS. Sides of a ratio are
+measured in turns and the median of the paired ratios is reported: rates drift on a shared machine, ratios far less.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from kinetok.motion.formats import read_deepmimic
+from kinetok.motion.library import ClipLibrary
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+
+CLIP = Path(__file__).parents[2] / "shared" / "data" / "train" / "deepmimic" / "humanoid3d_walk.txt"
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall-clock time of one call."""
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def env_step(clip: Path, rows: int, *, repetitions: int = 15, steps: int = 12) -> dict[str, float]:
+    """Env.step (physics, observation, reward, resets) against Batch.step alone, and against Gymnasium's loop.
+
+    Both sides step the same model, threads and substeps under the same controls, the reference's PD targets with
+    noise; before each repetition the raw batch starts from the environment's own states. The default encoder window
+    of seven future frames is observed; 10 s episodes keep their resets in the measurement.
+    """
+    table = ReferenceTable(ClipLibrary.of([read_deepmimic(clip)]))
+    task = Tracking(TrackingConfig(), table, rows=rows)
+    config = EnvConfig()
+    env = Env(config, task, rows=rows)
+    raw = Batch(env.sim.model, rows)
+    state = {name: raw.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+    gym = gymnasium.make("Humanoid-v5")
+    gym.reset(seed=0)
+    gym.action_space.seed(0)
+    gym_actions = [gym.action_space.sample() for _ in range(100)]
+    rng, substeps = np.random.default_rng(0), config.scene.substeps
+    env.reset(spread=True)
+    finished, samples = 0, []
+
+    def controls(ahead: int) -> np.ndarray:
+        frame = np.minimum(task.frame + ahead, table.last[task.clip])
+        return table.target[frame] + 0.05 * rng.standard_normal((rows, env.action_size), dtype=np.float32)
+
+    def step_env(actions: list[np.ndarray]) -> None:
+        nonlocal finished
+        for action in actions:
+            finished += len(env.step(action).done)
+
+    def step_raw(actions: list[np.ndarray]) -> None:
+        for action in actions:
+            state["ctrl"][:] = action
+            raw.step(nstep=substeps)
+
+    def step_gym() -> None:
+        for action in gym_actions:
+            _, _, terminated, truncated, _ = gym.step(action)
+            if terminated or truncated:
+                gym.reset()
+
+    for repetition in range(repetitions + 2):  # the first two warm caches and let episodes spread
+        actions = [controls(1 + k) for k in range(steps)]
+        state["qpos"][:], state["qvel"][:], state["qacc_warmstart"][:] = env.sim.qpos, env.sim.qvel, 0
+        pair = [(step_raw, actions), (step_env, actions)]
+        times = {
+            work: seconds(lambda work=work, given=given: work(given)) for work, given in pair[:: (-1) ** repetition]
+        }
+        samples.append((times[step_raw], times[step_env], seconds(step_gym) / len(gym_actions)))
+    raw_s, env_s, gym_s = np.array(samples[2:]).T
+    count = rows * steps
+    return {
+        "rows": rows,
+        "observation": env.obs_size,
+        "env_steps_per_second": count / float(np.median(env_s)),
+        "raw_steps_per_second": count / float(np.median(raw_s)),
+        "gymnasium_steps_per_second": 1 / float(np.median(gym_s)),
+        "ratio_to_raw": float(np.median(raw_s / env_s)),
+        "ratio_to_gymnasium": float(np.median(gym_s * count / env_s)),
+        "episodes_finished": finished,
+    }
+
+
+BENCHMARKS: dict[str, Callable[[Path], object]] = {
+    "env_step": lambda clip: [env_step(clip, rows) for rows in (512, 1024)],
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help=f"which to run: {', '.join(BENCHMARKS)}; all when none is named")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
+    parser.add_argument("--clip", type=Path, default=CLIP, help="a DeepMimic walk")
+    options = parser.parse_args()
+    unknown = set(options.names) - set(BENCHMARKS)
+    if unknown:
+        parser.error(f"unknown benchmark {sorted(unknown)}; there are: {', '.join(BENCHMARKS)}")
+    if not options.clip.exists():
+        raise SystemExit(f"skipped: no clip at {options.clip}; give a DeepMimic walk with --clip")
+    results: dict[str, object] = {
+        "machine": {"cpus": os.cpu_count(), "load": os.getloadavg()[0], "python": platform.python_version()},
+        "mujoco": mujoco.__version__,
+    }
+    for name in options.names or BENCHMARKS:
+        results[name] = BENCHMARKS[name](options.clip)
+        print(f"{name}: {json.dumps(results[name], indent=2)}")
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,5 @@
+"""Motion made visible: frames, videos and strips of stills. It draws poses; it does not simulate."""
+
+from kinetok.render.video import RenderError, render_frames, write_strip, write_video
+
+__all__ = ["RenderError", "render_frames", "write_strip", "write_video"]

@@ -1,0 +1,117 @@
+"""video.py: frames show the figure where it should be, videos decode to what was written, messages."""
+
+import ctypes
+import os
+import subprocess
+import sys
+
+import imageio_ffmpeg
+import matplotlib.image
+import numpy as np
+import pytest
+
+from kinetok.render import RenderError, render_frames, write_strip, write_video
+
+SIZE = (160, 90)
+
+
+@pytest.fixture(scope="module")
+def egl():
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        pytest.skip("no EGL library: install libegl1")
+
+
+@pytest.fixture(scope="module")
+def qpos(table):
+    return table.qpos[:10]
+
+
+@pytest.fixture(scope="module")
+def frames(egl, humanoid, qpos):
+    return list(render_frames(humanoid, qpos, fps=30, size=SIZE))
+
+
+def test_frames_show_a_figure_on_a_floor(frames):
+    assert [(f.shape, f.dtype) for f in frames] == [((90, 160, 3), np.uint8)] * 10
+    middle, border = frames[0][20:75, 70:90].astype(int), frames[0][20:75, :20].astype(int)
+    assert middle.min() < border.min() - 20  # the figure is darker than the floor, and in the middle
+    assert frames[0][-1].mean() > 120 and frames[0][0, :, 2].mean() > frames[0][0, :, 0].mean()  # a floor, a blue sky
+
+
+def test_the_figure_moves(frames):
+    assert np.abs(frames[9].astype(int) - frames[0]).max() > 50
+
+
+def test_ghost_and_caption(egl, frames, humanoid, qpos):
+    ghost = qpos.copy()
+    ghost[:, 1] += 0.6
+    shown = next(render_frames(humanoid, qpos, fps=30, size=SIZE, ghost=ghost))
+    orange = (shown[..., 0].astype(int) - shown[..., 2]) > 60
+    assert orange.sum() > 30 and ((frames[0][..., 0].astype(int) - frames[0][..., 2]) > 60).sum() == 0
+    captioned = next(render_frames(humanoid, qpos, fps=30, size=SIZE, caption="walk"))
+    changed = np.argwhere((captioned != frames[0]).any(-1))
+    assert len(changed) and changed.max(0)[0] < 30 and changed.max(0)[1] < 80  # the upper left corner only
+
+
+def test_video_decodes_to_what_was_written(tmp_path, frames):
+    path = tmp_path / "new" / "clip.mp4"
+    write_video(path, frames, 25)
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    assert (meta["size"], meta["fps"], meta["codec"]) == (SIZE, 25.0, "h264") and "yuv420p" in meta["pix_fmt"]
+    decoded = [np.frombuffer(raw, np.uint8).reshape(90, 160, 3).astype(int) for raw in reader]
+    assert len(decoded) == 10
+    assert max(np.abs(a - b).mean() for a, b in zip(decoded, frames, strict=True)) < 8
+    assert [p.name for p in path.parent.iterdir()] == ["clip.mp4"]
+
+
+def test_strip(egl, tmp_path, humanoid, qpos):
+    path = tmp_path / "clip.png"
+    write_strip(path, humanoid, qpos, columns=3, rows=2, size=(40, 60))
+    image = matplotlib.image.imread(path)
+    assert image.shape[:2] == (120, 120)
+    assert np.abs(image[:60, :40] - image[60:, 80:]).max() > 0.2  # the first and the last still differ
+
+
+def test_messages(tmp_path, humanoid, qpos):
+    with pytest.raises(ValueError, match=r"qpos has shape \(10, 7\); 'humanoid' needs \(T, 43\)"):
+        render_frames(humanoid, qpos[:, :7], fps=30)
+    with pytest.raises(ValueError, match=r"ghost has shape \(4, 43\); 'humanoid' needs \(10, 43\)"):
+        render_frames(humanoid, qpos, fps=30, ghost=qpos[:4])
+    with pytest.raises(ValueError, match="no frames; a video needs at least one"):
+        write_video(tmp_path / "a.mp4", [], 30)
+    with pytest.raises(ValueError, match=r"frames are 5 x 4; H.264 needs even sides"):
+        write_video(tmp_path / "a.mp4", [np.zeros((4, 5, 3), np.uint8)], 30)
+
+
+def test_an_encoder_error_is_shown_and_leaves_no_file(tmp_path):
+    with pytest.raises(RenderError, match="ffmpeg ended with code"):
+        write_video(tmp_path / "a.mp4", [np.zeros((4, 4, 3), np.uint8)], 0.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+NO_EGL = """
+import ctypes
+load = ctypes.CDLL.__init__
+def init(self, name, *args, **kwargs):
+    if "EGL" in str(name):
+        raise OSError(f"{name}: cannot open shared object file")
+    load(self, name, *args, **kwargs)
+ctypes.CDLL.__init__ = init
+import numpy as np
+from kinetok.motion.character import Character
+from kinetok.render import render_frames
+body = Character.load("humanoid")
+next(render_frames(body, np.array(body.model.qpos0)[None], fps=30))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is how Linux draws without a display")
+def test_without_egl_the_message_names_the_package():
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM")
+    environment = {k: v for k, v in os.environ.items() if k not in hidden}
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    result = subprocess.run([sys.executable, "-c", NO_EGL], capture_output=True, text=True, env=environment, cwd=root)
+    assert "RenderError: MuJoCo cannot draw here" in result.stderr and "install libegl1" in result.stderr, result.stderr

@@ -1,0 +1,171 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from kinetok.checkpoint import CheckpointError, load_artifact, load_state
+from kinetok.logger import read_metrics
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
+from kinetok.tokenizers import distill as module
+from kinetok.tokenizers.distill import DistillStage, _View, distill
+from kinetok.tokenizers.fit import new_tokenizer
+from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.track import track
+
+
+@pytest.fixture(scope="module")
+def teachers(small, standing) -> list[MotionTokenizer]:
+    """Experts that nobody trained: fixed maps from observations to targets, one per clip."""
+    made = [new_tokenizer(small.teacher_tokenizer, standing, seed) for seed in (3, 4)]
+    for teacher in made:
+        torch.nn.init.normal_(teacher.decoder[-1].weight, std=0.05, generator=torch.Generator().manual_seed(3))
+    return made
+
+
+@pytest.fixture(scope="module")
+def config(small) -> DistillStage:
+    """Forty steps with an evaluation after the twentieth and the last."""
+    env = EnvConfig(reset_noise=0.01, push=0.5, episode_seconds=0.5)
+    return replace(small.distill, samples=40 * 32, eval_every=20 * 32, env=env)
+
+
+@pytest.fixture(scope="module")
+def whole(config, small, standing, teachers, tmp_path_factory):
+    """One distillation that was never interrupted: its folder and its score."""
+    out = tmp_path_factory.mktemp("whole")
+    score = distill(new_tokenizer(small.tokenizer, standing, 0), teachers, standing, config, out, quiet=True)
+    return out, score
+
+
+def untimed(out) -> list[dict]:
+    return [{k: v for k, v in line.items() if k != "time"} for line in read_metrics(out / "metrics.jsonl")]
+
+
+def same(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_the_student_learns_what_the_teachers_do(student, teachers, standing, config, tmp_path):
+    longer = replace(config, samples=160 * 32, eval_every=160 * 32, updates=3, minibatch=256, memory=4096, lr=3e-3)
+    distill(student, teachers, standing, longer, tmp_path, quiet=True)
+    errors = [line["label_rmse"] for line in untimed(tmp_path)]
+    assert len(errors) == 8 and errors[-1] < 0.6 * errors[0]
+
+
+def test_a_resumed_run_is_the_unbroken_one(whole, config, small, student, teachers, standing, tmp_path, cut_off):
+    out, score = whole
+    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    assert load_state(tmp_path / "state.safetensors")[1]["step"] == 20
+    fresh = new_tokenizer(small.tokenizer, standing, 5)  # its weights come from the state
+    resumed = distill(fresh, teachers, standing, config, tmp_path, quiet=True)
+    assert resumed.to_json() == score.to_json()
+    (tensors, meta), (expected, expected_meta) = (
+        load_state(folder / "state.safetensors") for folder in (tmp_path, out)
+    )
+    assert same(tensors, expected) and meta == expected_meta
+    assert untimed(tmp_path) == untimed(out) and [line["step"] for line in untimed(out)] == [640, 1280]
+    assert load_artifact(tmp_path).hash == load_artifact(out).hash
+
+
+def test_it_returns_the_kept_student_and_its_score(whole, config, student, teachers, standing, monkeypatch):
+    out, score = whole
+    kept = MotionTokenizer.from_pretrained(out)
+    again = track(kept, standing, future=kept.config.future, episodes=config.eval_episodes)
+    assert again.to_json() == score.to_json()
+
+    def fail(*args, **kwargs):
+        raise AssertionError("a finished run trains or evaluates")
+
+    monkeypatch.setattr(module, "track", fail)
+    monkeypatch.setattr(module, "_regress", fail)
+    assert distill(student, teachers, standing, config, out, quiet=True).to_json() == score.to_json()
+    assert same(student.state_dict(), kept.state_dict())
+
+
+def test_when_nothing_better_follows_a_resume_the_kept_score_is_returned(
+    config, student, teachers, standing, tmp_path, cut_off, monkeypatch
+):
+    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    kept, real = load_artifact(tmp_path).hash, module.track
+    monkeypatch.setattr(module, "track", lambda *a, **k: replace(real(*a, **k), mpjpe_mm=np.full(2, 9e9)))
+    score = distill(student, teachers, standing, config, tmp_path, quiet=True)
+    assert load_artifact(tmp_path).hash == kept
+    again = real(student, standing, future=student.config.future, episodes=config.eval_episodes)
+    assert score.to_json() == again.to_json()
+
+
+@pytest.mark.parametrize("future", [(1, 2, 5), (5,), (5, 1)])
+def test_a_teacher_sees_its_own_observation(small, standing, future):
+    """The columns a view picks are, bit for bit, what a tracking task with the teacher's window observes."""
+    teacher = new_tokenizer(replace(small.teacher_tokenizer, future=future), standing, 0)
+    obs = {}
+    for window in (small.tokenizer.future, future):
+        task = Tracking(TrackingConfig(future=window), standing, rows=6)
+        env = Env(EnvConfig(reset_noise=0.05), task, rows=6, threads=1, seed=1)
+        env.reset()
+        action = standing.target[:6] + 0.2
+        obs[window] = [torch.from_numpy(env.step(action).obs) for _ in range(4)]
+    view = _View(teacher, Tracking(TrackingConfig(future=small.tokenizer.future), standing, rows=6))
+    for student_sees, teacher_sees in zip(obs[small.tokenizer.future], obs[future], strict=True):
+        assert torch.equal(student_sees[:, view.columns], teacher_sees)
+        with torch.no_grad():
+            assert torch.equal(view.act(student_sees), teacher.act(teacher_sees)[0])
+
+
+def test_every_clip_is_labelled_by_its_own_teacher(student, teachers, standing, config, tmp_path, monkeypatch):
+    """With swapped teachers the same states get other labels, so the student learns another map."""
+    short = replace(config, samples=20 * 32)
+    weights = []
+    for name, order in (("a", teachers), ("b", teachers[::-1]), ("c", teachers)):
+        pupil = new_tokenizer(student.config, standing, 0)
+        distill(pupil, order, standing, short, tmp_path / name, quiet=True)
+        weights.append(pupil.state_dict())
+    assert same(weights[0], weights[2]) and not same(weights[0], weights[1])
+
+
+def far(small, standing) -> MotionTokenizer:
+    return new_tokenizer(replace(small.teacher_tokenizer, future=(1, 30)), standing, 0)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda run, teachers, **_: run(teachers[:1]),
+            ValueError,
+            "2 clips need a teacher each (the same one may repeat), not 1",
+        ),
+        (
+            lambda run, teachers, small, standing, **_: run([teachers[0], far(small, standing)]),
+            ValueError,
+            "teacher looks [30] steps ahead, the student only (1, 2, 5)",
+        ),
+        (
+            lambda run, teachers, whole, config, **_: run(teachers, replace(config, noise=0.5), whole[0]),
+            CheckpointError,
+            "stage.noise: 0.02 -> 0.5",
+        ),
+    ],
+)
+def test_messages(call, error, message, whole, config, small, student, teachers, standing, tmp_path):
+    def run(labels, stage=config, out=tmp_path / "out"):
+        distill(student, labels, standing, stage, out, quiet=True)
+
+    with pytest.raises(error, match=re.escape(message)):
+        call(run=run, teachers=teachers, small=small, standing=standing, whole=whole, config=config)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_state(
+    config, small, student, teachers, standing, tmp_path, cut_off
+):
+    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    before = (tmp_path / "state.safetensors").read_bytes()
+    broken = new_tokenizer(small.teacher_tokenizer, standing, 3)
+    torch.nn.init.constant_(broken.decoder[-1].bias, float("nan"))
+    with pytest.raises(FloatingPointError, match="distillation loss is nan"):
+        distill(student, [broken, broken], standing, config, tmp_path, quiet=True)
+    assert (tmp_path / "state.safetensors").read_bytes() == before

@@ -1,0 +1,160 @@
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kinetok.checkpoint import CheckpointError, load_artifact
+from kinetok.config import ConfigError, override
+from kinetok.motion.clip import Clip
+from kinetok.tokenizers import distill, train
+from kinetok.tokenizers.fit import fit, train_teachers
+
+
+@pytest.fixture(scope="module")
+def clips(wave) -> list[Clip]:
+    return [wave("wave", 0.5), wave("sweep", 0.5, reach=-0.8)]
+
+
+@pytest.fixture(scope="module")
+def done(clips, small, tmp_path_factory):
+    """A finished fit of all three stages: its folder and the tokenizer."""
+    out = tmp_path_factory.mktemp("fit") / "run"
+    return out, fit(clips, small, out, seed=0)
+
+
+def test_every_stage_leaves_its_artifact(done):
+    out, tokenizer = done
+    for path in ("teachers/wave", "teachers/sweep", "distill", "ppo", "."):
+        assert load_artifact(out / path, kind="tokenizer").tensors
+    best = load_artifact(out)
+    assert best.hash == tokenizer.hash
+    assert best.hash in {load_artifact(out / stage).hash for stage in ("distill", "ppo")}
+    teachers = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in ("wave", "sweep")}
+    assert load_artifact(out / "distill").parents == teachers
+
+
+def test_cards_say_what_made_them(done):
+    out, _ = done
+    stories = {
+        "teachers/wave": "Stages: teacher.",
+        "distill": "Stages: teacher -> distill.",
+        "ppo": "Stages: teacher -> distill -> ppo.",
+    }
+    for path, story in stories.items():
+        card = (out / path / "README.md").read_text()
+        assert story in card and "MPJPE" in card and "Seed 0" in card
+    assert "2 tokens per control step from a vocabulary of 125" in (out / "README.md").read_text()
+    assert "tokens per control step" not in (out / "teachers" / "wave" / "README.md").read_text()
+
+
+def test_a_finished_fit_returns_at_once(done, clips, small, monkeypatch):
+    out, tokenizer = done
+
+    def fail(*args, **kwargs):
+        raise AssertionError("a finished run trains or evaluates")
+
+    monkeypatch.setattr(train, "collect", fail)
+    monkeypatch.setattr(train, "track", fail)
+    monkeypatch.setattr(distill, "track", fail)
+    assert fit(clips, small, out, seed=0).hash == tokenizer.hash
+
+
+def test_a_fit_repeats_itself_at_any_thread_count(done, clips, small, tmp_path):
+    out, tokenizer = done
+    before = torch.get_num_threads()
+    again = fit(clips, small, tmp_path / "again", seed=0, threads=2)
+    assert again.hash == tokenizer.hash and torch.get_num_threads() == before
+    for path in ("teachers/wave", "teachers/sweep", "distill", "ppo"):
+        assert load_artifact(out / path).hash == load_artifact(tmp_path / "again" / path).hash
+
+
+@pytest.mark.slow
+def test_teachers_side_by_side_are_the_same(done, clips, small, tmp_path):
+    out, _ = done
+    train_teachers(clips, replace(small, workers=2), tmp_path, seed=0, threads=0)
+    for clip in clips:
+        assert load_artifact(tmp_path / clip.name).hash == load_artifact(out / "teachers" / clip.name).hash
+
+
+@pytest.mark.slow
+def test_the_first_error_stops_the_teachers_that_wait(wave, small, tmp_path):
+    """Eight teachers, two at a time; the first cannot write its folder."""
+    names = [f"w{index}" for index in range(8)]
+    (tmp_path / "w0").write_text("in the way")
+    with pytest.raises(OSError, match="w0"):
+        train_teachers([wave(name, 0.5) for name in names], replace(small, workers=2), tmp_path, seed=0, threads=0)
+    assert not (tmp_path / "w7").exists()
+
+
+def test_from_scratch_needs_no_teacher(clips, small, tmp_path):
+    fit(clips[:1], replace(small, stages=("ppo",)), tmp_path / "out")
+    assert not (tmp_path / "out" / "teachers").exists()
+    assert "Stages: ppo." in (tmp_path / "out" / "README.md").read_text()
+
+
+def other_body(tmp_path) -> Clip:
+    from kinetok.motion.character import Character
+    from tests.conftest import TINY
+
+    path = tmp_path / "box.xml"
+    path.write_text(TINY)
+    qpos = Character.load(str(path)).model.qpos0
+    return Clip(name="box", character=str(path), fps=30.0, qpos=qpos[None].repeat(5, 0))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (
+            lambda clips, small, tmp_path: ([clips[0], clips[0]], small),
+            ConfigError,
+            "two clips are named 'wave'; rename a file",
+        ),
+        (lambda clips, small, tmp_path: ([], small), ValueError, "at least one clip"),
+        (
+            lambda clips, small, tmp_path: ([other_body(tmp_path)], small),
+            ConfigError,
+            "tokenizer.character is 'humanoid'; set tokenizer.character=",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, replace(small, stages=("teacher", "distil"))),
+            ConfigError,
+            "unknown stage 'distil'; did you mean 'distill'?; stages: teacher, distill, ppo",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["tokenizer.scalars=4"])),
+            ValueError,
+            "cannot group 6 scalars by 4: scalars per token must be a divisor of 6",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["teacher_tokenizer.future=1,9"])),
+            ConfigError,
+            "teacher_tokenizer.future looks [9] steps ahead, which tokenizer.future (1, 2, 5) does not hold",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["ppo.env.scene.substeps=2"])),
+            ConfigError,
+            "a stage's env.scene differs from tokenizer.scene (substeps: 4 -> 2); set the latter",
+        ),
+    ],
+)
+def test_refused_before_anything_is_written(change, error, message, clips, small, tmp_path):
+    with pytest.raises(error, match=re.escape(message)):
+        fit(*change(clips, small, tmp_path), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_a_foreign_readme_is_left_alone(clips, small, tmp_path):
+    (tmp_path / "README.md").write_text("mine")
+    with pytest.raises(CheckpointError, match=r"holds a README\.md that kinetok did not write"):
+        fit(clips, small, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+    assert (tmp_path / "README.md").read_text() == "mine"
+
+
+def test_finished_teachers_are_not_passed_off_as_others(done, clips, small):
+    out, _ = done
+    changed = replace(small, teacher=replace(small.teacher, samples=2048))
+    with pytest.raises(CheckpointError, match=r"stage\.samples: 1024 -> 2048"):
+        fit(clips, changed, out)

@@ -1,0 +1,71 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from kinetok.motion.library import ClipLibrary
+from kinetok.sim.tasks.tracking import ReferenceTable
+from kinetok.tokenizers.track import TrackingScore, track
+
+
+class Follow:
+    """Plays the PD target that each observation ends with, bent by `offset` radians."""
+
+    def __init__(self, actions: int, offset: float = 0.0):
+        self.actions, self.offset = actions, offset
+
+    def act(self, obs: torch.Tensor):
+        return obs[:, -self.actions :] + self.offset, torch.zeros(()), {}
+
+
+@pytest.fixture(scope="module")
+def good(standing):
+    return track(Follow(standing.character.nu), standing, future=(1,), episodes=3)
+
+
+def test_a_follower_of_a_standing_clip_succeeds(good):
+    assert good.names == ("wave", "sweep") and good.episodes == 3
+    assert (good.success == 1).all() and (good.success_mean_error == 1).all()
+    assert (good.mpjpe_mm < 100).all()
+    # three episodes of a clip that ends: from frames 0, 5 and 10 of 30, so 30, 25 and 20 steps of 1/30 s
+    assert np.allclose(good.seconds, (30 + 25 + 20) / 3 / 30)
+
+
+def test_a_broken_body_scores_less(standing, good):
+    bad = track(Follow(standing.character.nu, offset=2.0), standing, future=(1,), episodes=3)
+    assert (bad.mpjpe_mm > good.mpjpe_mm).all() and bad.merit < good.merit
+
+
+def test_a_simulation_that_blows_up_fails_with_a_finite_score(standing):
+    score = track(Follow(standing.character.nu, offset=float("nan")), standing, future=(1,), episodes=2)
+    assert (score.success == 0).all() and (score.success_mean_error == 0).all()
+    assert np.isfinite(score.mpjpe_mm).all() and np.isfinite(score.merit)
+
+
+def test_a_loop_runs_for_the_seconds_asked_for(wave):
+    table = ReferenceTable(ClipLibrary.of([wave("loop", loop=True)]), seconds=3)
+    score = track(Follow(table.character.nu), table, future=(1,), episodes=2, seconds=1.2)
+    assert score.seconds.tolist() == [1.2] and score.success.tolist() == [1.0]
+
+
+def test_scores_do_not_depend_on_threads(standing, good):
+    again = track(Follow(standing.character.nu), standing, future=(1,), episodes=3, threads=2)
+    assert again.to_json() == good.to_json()
+
+
+def test_pushes_are_felt_and_seeded(standing, good):
+    once, twice, other = (
+        track(Follow(standing.character.nu), standing, future=(1,), push=1.0, push_seconds=0.2, episodes=3, seed=seed)
+        for seed in (0, 0, 1)
+    )
+    assert (once.mpjpe_mm > good.mpjpe_mm).all()
+    assert once.to_json() == twice.to_json() != other.to_json()
+
+
+def test_json_round_trip_is_exact(good):
+    again = TrackingScore.from_json(json.loads(json.dumps(good.to_json())))
+    assert again.names == good.names and again.episodes == good.episodes
+    for name in ("success", "success_mean_error", "mpjpe_mm", "seconds"):
+        assert np.array_equal(getattr(again, name), getattr(good, name))
+    assert again.merit == good.merit
