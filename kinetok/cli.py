@@ -45,7 +45,8 @@ option_threads = click.option(
     default=0,
     show_default=True,
     type=NATURAL,
-    help="Threads of physics and networks; 0 is every core. Changes speed only.",
+    help="Threads of physics and networks; 0 is every core. Physics is the same at any; a network's sums differ "
+    "in the last bits.",
 )
 
 

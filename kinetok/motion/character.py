@@ -31,7 +31,8 @@ class Character:
     Fields: name; xml: the MJCF text; roles: {"feet": [...], "hands": [...], "head": ...} by body name;
     model: the compiled MjModel of the character alone (no floor); body_names (B,) without the world;
     parents (B,) index into body_names, -1 for the root; kp, kd, torque (nu,) in N m / rad, N m s / rad, N m;
-    ball (nj, 2): for each ball joint its first qpos and first actuator column; hinge (nj, 2) likewise.
+    ball (nj, 2): for each ball joint its first qpos and first actuator column; hinge (nj, 2) likewise; dof (nu,):
+    the degree of freedom each actuator drives.
     """
 
     name: str
@@ -114,7 +115,12 @@ def from_mjcf(name: str, xml: str, roles: dict) -> Character:
         joint = model.actuator_trnid[u, 0]
         q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
-            axis = int(np.argmax(np.abs(model.actuator_gear[u, :3])))
+            axis = u - ball[-1][1] if ball and ball[-1][0] == q else 0
+            if axis > 2 or not np.array_equal(model.actuator_gear[u, :3], np.eye(3)[axis]):
+                raise ConfigError(
+                    f"character {name!r}: actuator {model.actuator(u).name!r} of a ball joint; such a joint needs three "
+                    'in a row, with gear "1 0 0", "0 1 0" and "0 0 1"'
+                )
             dof[u] = d + axis
             if axis == 0:
                 ball.append((q, u))

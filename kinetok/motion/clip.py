@@ -66,9 +66,20 @@ class Clip:
         return pose
 
     def resample(self, fps: float) -> "Clip":
-        """The same motion at another frame rate; the last frame may fall up to 1/fps seconds earlier."""
-        count = int(self.seconds * fps + 1e-6) + 1
-        return replace(self, fps=fps, qpos=self.at(np.minimum(np.arange(count) / fps, self.seconds - 1e-9)))
+        """The same motion at another frame rate.
+
+        A loop keeps its whole cycle, so its rate is the nearest one that divides it; of any other clip the last frame
+        may fall up to 1/fps seconds earlier.
+        """
+        if self.loop:
+            count = max(round(self.seconds * fps), 1)
+            fps = count / self.seconds
+        else:
+            count = int(self.seconds * fps + 1e-6)
+        times = np.arange(count + 1) / fps
+        qpos = self.at(np.minimum(times, self.seconds - 1e-9))
+        qpos[-1] = self.qpos[-1] if self.loop else qpos[-1]
+        return replace(self, fps=fps, qpos=qpos)
 
     def slice(self, start: float, stop: float) -> "Clip":
         """The part from start to stop seconds, no longer a loop."""

@@ -161,7 +161,7 @@ class Env:
     def _start(self, ids: np.ndarray) -> None:
         qpos, qvel = self.task.start(ids, self.rng)
         if self.config.reset_noise:
-            qpos, qvel = perturb(qpos, qvel, self.config.reset_noise, self.rng)
+            qpos, qvel = perturb(self.task.character, qpos, qvel, self.config.reset_noise, self.rng)
         self.sim.set_state(ids, qpos, qvel)
         self.age[ids] = 0
         self._returns[ids] = 0

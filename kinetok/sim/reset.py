@@ -2,6 +2,9 @@
 
 import numpy as np
 
+from kinetok import rotation
+from kinetok.motion.character import Character
+
 
 class ClipWeights:
     """Failure-weighted sampling (GPC eq. 9): w <- w * gamma**K on success, w / gamma**K on failure.
@@ -20,14 +23,19 @@ class ClipWeights:
 
 
 def perturb(
-    qpos: np.ndarray, qvel: np.ndarray, scale: float, rng: np.random.Generator
+    body: Character, qpos: np.ndarray, qvel: np.ndarray, scale: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Noisy copies of poses (n, nq) and velocities (n, nv): the start states of a robust tracker.
 
-    scale is in radians for joints; velocities get ten times as much per second. The root keeps its place.
+    Every joint turns by `scale` radians about each of its axes, a ball joint about all three; joint velocities
+    change by ten times as much per second, the root's by three times. The root keeps its place.
     """
-    from_pose = qpos.copy()
-    from_pose[:, 7:] += scale * rng.standard_normal(qpos[:, 7:].shape)  # MuJoCo renormalises the quaternions
-    return from_pose, qvel + 10 * scale * rng.standard_normal(qvel.shape) * np.r_[
-        [0.3] * 6, [1.0] * (qvel.shape[1] - 6)
-    ]
+    noisy = qpos.copy()
+    hinges = body.hinge[:, 0]
+    noisy[:, hinges] += scale * rng.standard_normal((len(qpos), len(hinges)))
+    balls = body.ball[:, :1] + np.arange(4)
+    turn = rotation.from_rotvec(scale * rng.standard_normal((len(qpos), len(balls), 3)))
+    noisy[:, balls] = rotation.multiply(noisy[:, balls], turn)
+    spread = np.full(qvel.shape[1], 10 * scale)
+    spread[:6] = 3 * scale
+    return noisy, qvel + spread * rng.standard_normal(qvel.shape)

@@ -30,7 +30,7 @@ from kinetok.tokenizers.train import identify, in_scene, refuse_changed
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; noise: radians added to the student's targets while it acts; save_every: samples
-    between states to resume from (the memory starts anew there, so not too often)."""
+    between states to resume from, at the next evaluation (the memory starts anew there, so not too often)."""
 
     samples: int = 200_000
     rows: int = 256
@@ -110,7 +110,8 @@ def distill(
             step += 1
             samples = step * config.rows
             metrics = {"label_rmse": float(loss) ** 0.5} if step % 20 == 0 else {}
-            if samples - evaluated >= config.eval_every or step == total:
+            due = samples - evaluated >= config.eval_every or step == total
+            if due:
                 evaluated = samples
                 score = track(
                     student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
@@ -121,7 +122,8 @@ def distill(
                     student.save_pretrained(out, card(score), parents)
             if metrics:
                 log.write(samples, metrics)
-            if samples - saved >= config.save_every or step == total:
+            # Only right after an evaluation, from where its schedule and the episodes' sums start anew.
+            if due and (samples - saved >= config.save_every or step == total):
                 saved = samples
                 tensors, skeleton = flatten(
                     {

@@ -182,11 +182,13 @@ def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed:
             refuse_changed(state, load_state(state)[1]["identity"], identity, PPOStage)
     jobs = [(clip, config, out / clip.name, seed) for clip in clips if not (out / clip.name / "done").exists()]
     if len(jobs) <= 1 or config.workers <= 1:
-        for job in jobs:
-            _teach(*job, threads=threads, quiet=False)
+        # Sums of a network depend on its threads: one for each of many teachers, as in the pool.
+        with torch_threads(torch.get_num_threads() if len(clips) == 1 else 1):
+            for job in jobs:
+                _teach(*job, threads=threads, quiet=False)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(config.workers, context, torch.set_num_threads, (1,)) as pool:
         running = {pool.submit(_teach, *job, threads=1, quiet=True): job[0].name for job in jobs}
         try:
             _report(running, len(jobs))
@@ -207,8 +209,6 @@ def _settings(config: FitConfig) -> TokenizerConfig:
 
 
 def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool) -> str:
-    if threads:
-        torch.set_num_threads(threads)
     settings = _settings(config)
     table = ReferenceTable(ClipLibrary.of([clip]), control_hz=settings.scene.control_hz)
     teacher = new_tokenizer(settings, table, seed)

@@ -15,11 +15,13 @@ def test_weights_by_hand():
     assert weights.values.tolist() == [0.1, 10.0, 1.0]
 
 
-def test_perturb_leaves_the_root_and_its_arguments_alone():
-    qpos, qvel = np.zeros((4000, 12)), np.zeros((4000, 10))
-    noisy, fast = perturb(qpos, qvel, 0.05, np.random.default_rng(0))
-    assert (qpos == 0).all() and (qvel == 0).all()
-    assert (noisy[:, :7] == 0).all()
-    assert noisy[:, 7:].std() == pytest.approx(0.05, rel=0.05)
+def test_perturb_turns_every_joint_by_the_scale_and_leaves_the_root_and_its_arguments_alone(humanoid):
+    qpos = np.repeat(humanoid.model.qpos0[None], 4000, axis=0)
+    qvel = np.zeros((4000, humanoid.nv))
+    noisy, fast = perturb(humanoid, qpos, qvel, 0.05, np.random.default_rng(0))
+    assert (qpos == humanoid.model.qpos0).all() and (qvel == 0).all()
+    assert (noisy[:, :7] == qpos[:, :7]).all()
+    # The rest pose has zero angles, so the PD targets of the noisy pose are the noise itself.
+    assert humanoid.pose_to_ctrl(noisy).std(0) == pytest.approx(0.05, rel=0.08)
     assert fast[:, 6:].std() == pytest.approx(0.5, rel=0.05)
     assert fast[:, :6].std() == pytest.approx(0.15, rel=0.05)

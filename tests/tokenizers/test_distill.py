@@ -27,9 +27,9 @@ def teachers(small, standing) -> list[MotionTokenizer]:
 
 @pytest.fixture(scope="module")
 def config(small) -> DistillStage:
-    """Forty steps with an evaluation after the twentieth and the last."""
+    """Forty steps, an evaluation every ten, and a state after every other evaluation."""
     env = EnvConfig(reset_noise=0.01, push=0.5, episode_seconds=0.5)
-    return replace(small.distill, samples=40 * 32, eval_every=20 * 32, env=env)
+    return replace(small.distill, samples=40 * 32, eval_every=10 * 32, save_every=11 * 32, env=env)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_the_student_learns_what_the_teachers_do(student, teachers, standing, co
 
 def test_a_resumed_run_is_the_unbroken_one(whole, config, small, student, teachers, standing, tmp_path, cut_off):
     out, score = whole
-    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    cut_off(module, 3, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
     assert load_state(tmp_path / "state.safetensors")[1]["step"] == 20
     fresh = new_tokenizer(small.tokenizer, standing, 5)  # its weights come from the state
     resumed = distill(fresh, teachers, standing, config, tmp_path, quiet=True)
@@ -66,7 +66,7 @@ def test_a_resumed_run_is_the_unbroken_one(whole, config, small, student, teache
         load_state(folder / "state.safetensors") for folder in (tmp_path, out)
     )
     assert same(tensors, expected) and meta == expected_meta
-    assert untimed(tmp_path) == untimed(out) and [line["step"] for line in untimed(out)] == [640, 1280]
+    assert untimed(tmp_path) == untimed(out) and [line["step"] for line in untimed(out)] == [320, 640, 960, 1280]
     assert load_artifact(tmp_path).hash == load_artifact(out).hash
 
 
@@ -88,7 +88,7 @@ def test_it_returns_the_kept_student_and_its_score(whole, config, student, teach
 def test_when_nothing_better_follows_a_resume_the_kept_score_is_returned(
     config, student, teachers, standing, tmp_path, cut_off, monkeypatch
 ):
-    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    cut_off(module, 3, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
     kept, real = load_artifact(tmp_path).hash, module.track
     monkeypatch.setattr(module, "track", lambda *a, **k: replace(real(*a, **k), mpjpe_mm=np.full(2, 9e9)))
     score = distill(student, teachers, standing, config, tmp_path, quiet=True)
@@ -162,7 +162,7 @@ def test_messages(call, error, message, whole, config, small, student, teachers,
 def test_a_loss_that_is_not_finite_stops_and_keeps_the_state(
     config, small, student, teachers, standing, tmp_path, cut_off
 ):
-    cut_off(module, 2, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
+    cut_off(module, 3, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
     before = (tmp_path / "state.safetensors").read_bytes()
     broken = new_tokenizer(small.teacher_tokenizer, standing, 3)
     torch.nn.init.constant_(broken.decoder[-1].bias, float("nan"))

@@ -152,7 +152,7 @@ def test_a_state_from_before_a_setting_existed_goes_on(whole, config, student, s
     student.save_pretrained(tmp_path, "")
     no_training(monkeypatch)
     train_ppo(student, standing, config, tmp_path, quiet=True)
-    with pytest.raises(CheckpointError, match="stage.patience: 1000 -> 3"):
+    with pytest.raises(CheckpointError, match=r"stage\.patience: 1000 -> 3"):
         train_ppo(student, standing, replace(config, patience=3), tmp_path, quiet=True)
 
 
@@ -160,7 +160,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(half, config, student, wave):
     table = ReferenceTable(ClipLibrary.of([wave("wave"), wave("sweep", reach=-0.8)]))
     table.body.linear[:] = np.nan  # the reward's velocity term is not a number
     before = (half / "state.safetensors").read_bytes()
-    with pytest.raises(FloatingPointError, match="the last good state in .* is untouched"):
+    with pytest.raises(FloatingPointError, match=r"the last good state in .* is untouched"):
         train_ppo(student, table, config, half, quiet=True)
     assert (half / "state.safetensors").read_bytes() == before
     tensors, _ = load_state(half / "bad_rollout.safetensors")

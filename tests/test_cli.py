@@ -1,0 +1,284 @@
+"""The commands as a person types them; `--help` alone for those that need a trained prior."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from kinetok.checkpoint import load_artifact, save_artifact
+from kinetok.cli import main
+from kinetok.motion.formats import read_clips
+from kinetok.tokenizers.codec import TokenStream
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def apart(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def frames(count: int = 16) -> list[list[float]]:
+    """DeepMimic rows: duration, position (y up), root, chest, neck, right leg and arm, left leg and arm.
+
+    The figure stands and its left shoulder swings by half a radian.
+    """
+    identity = [1.0, 0.0, 0.0, 0.0]
+    rows = []
+    for t in np.linspace(0, 1, count):
+        half = 0.25 * np.sin(2 * np.pi * t)
+        limbs = [*identity, 0.0, *identity] + [*identity, 0.2] + [*identity, 0.0, *identity]
+        arm = [float(np.cos(half)), float(np.sin(half)), 0.0, 0.0, 0.2]
+        rows.append([1 / 30, 0.0, 0.9, 0.0, *identity, *identity, *identity, *limbs, *arm])
+    return rows
+
+
+def write_clip(path: Path, rows: list[list[float]]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"Loop": "none", "Frames": rows}))
+    return path
+
+
+def kinetok(*args: object) -> Result:
+    return CliRunner().invoke(main, [str(arg) for arg in args], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Path:
+    return write_clip(tmp_path_factory.mktemp("clips") / "humanoid3d_wave.txt", frames())
+
+
+@pytest.fixture(scope="module")
+def run(clip, tmp_path_factory) -> Path:
+    """A finished `tokenize fit`."""
+    out = tmp_path_factory.mktemp("run") / "wave"
+    result = kinetok("tokenize", "fit", "--clips", clip, "--out", out, "--preset", "tiny", "--set", "ppo.samples=512")
+    assert result.exit_code == 0 and "best stage" in result.output
+    return out
+
+
+@pytest.fixture(scope="module")
+def tokens(run, clip, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("tokens") / "wave.safetensors"
+    result = kinetok("tokenize", "encode", clip, "--tokenizer", run, "--out", out)
+    assert result.exit_code == 0 and f"wrote {out}: tokens (15, 2)" in result.output
+    return out
+
+
+def leaves(group: click.Group, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    found = []
+    for name, command in group.commands.items():
+        found += leaves(command, (*path, name)) if isinstance(command, click.Group) else [(*path, name)]
+    return found
+
+
+def command_at(path: tuple[str, ...]) -> click.Command:
+    command = main
+    for name in path:
+        command = command.commands[name]  # type: ignore[attr-defined]
+    return command
+
+
+def test_the_commands_stand_in_the_order_of_the_chain():
+    result = kinetok("--help")
+    assert result.exit_code == 0
+    order = [result.output.index(f"\n  {name} ") for name in ("clips", "tokenize", "pretrain", "sample", "evaluate")]
+    assert order == sorted(order)
+    assert "kinetok tokenize fit --clips walk.txt --out runs/w" in result.output
+    assert kinetok("--version").output.startswith("kinetok, version ")
+
+
+@pytest.mark.parametrize("path", leaves(main), ids=" ".join)
+def test_every_command_and_option_explains_itself(path):
+    result = kinetok(*path, "--help")
+    assert result.exit_code == 0 and "Usage: " in result.output
+    command = command_at(path)
+    assert command.help and len(command.help.split()) >= 6
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help, f"{' '.join(path)} {parameter.opts[0]} has no help"
+            assert parameter.opts[0] in result.output
+            shown = parameter.show_default or parameter.required or parameter.multiple or not parameter.default
+            assert shown, f"{' '.join(path)} {parameter.opts[0]} does not show its default {parameter.default}"
+
+
+@pytest.mark.parametrize("args", [["--help"], ["tokenize", "--help"], ["tokenize", "fit", "--help"]], ids=" ".join)
+def test_help_loads_no_torch(args):
+    code = (
+        "import sys\nfrom kinetok.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
+        "assert not {'torch', 'mujoco', 'numpy'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, *args], check=True, capture_output=True, cwd=Path(__file__).parents[1])
+
+
+def test_clips_info_says_what_a_file_holds(clip):
+    result = kinetok("clips", "info", clip)
+    header, row = result.output.splitlines()
+    assert header.split()[:5] == ["name", "frames", "fps", "seconds", "loop"]
+    assert row.split()[:5] == ["wave", "16", "30.00", "0.50", "no"]
+    assert abs(float(row.split()[5])) < 0.01 and row.endswith("humanoid3d_wave.txt")
+
+
+def test_clips_import_gathers_files_into_a_library(clip, tmp_path):
+    other = write_clip(tmp_path / "in" / "other.txt", frames(11))
+    out = tmp_path / "new" / "both.safetensors"
+    result = kinetok("clips", "import", clip, tmp_path / "in", "--out", out)
+    assert result.output == f"wrote {out}: 2 clips, 0.8 s\n"
+    assert [c.name for c in read_clips(out)] == ["wave", "other"]
+    assert kinetok("clips", "info", out).output.splitlines()[1:] == [
+        line for path in (clip, other) for line in kinetok("clips", "info", path).output.splitlines()[1:]
+    ]
+
+
+def test_fit_writes_every_stage_and_goes_on_where_it_was(run, clip):
+    assert load_artifact(run).kind == "tokenizer"
+    assert all(load_artifact(run / stage) for stage in ("teachers/wave", "distill", "ppo"))
+    before = load_artifact(run).hash
+    again = kinetok("tokenize", "fit", "--clips", clip, "--out", run, "--preset", "tiny", "--set", "ppo.samples=512")
+    assert again.exit_code == 0 and load_artifact(run).hash == before
+    changed = kinetok("tokenize", "fit", "--clips", clip, "--out", run, "--preset", "tiny", "--set", "ppo.samples=1024")
+    assert changed.exit_code == 1 and "stage.samples: 512 -> 1024" in changed.output
+
+
+def test_tokens_decode_to_the_motion_they_were_read_from(run, tokens, tmp_path):
+    out = tmp_path / "deep" / "again.safetensors"
+    result = kinetok("tokenize", "decode", tokens, "--tokenizer", run, "--out", out)
+    assert result.output == f"wrote {out}: 16 frames at 30 fps\n"
+    (motion,) = read_clips(out)
+    assert motion.name == "wave" and motion.source == "simulated"
+    assert np.abs(motion.qpos - TokenStream.load(tokens).simulated).max() < 1e-6  # a library keeps float32
+
+
+def gpt(path: Path) -> Path:
+    return save_artifact(path / "prior", kind="gpt", config={}, tensors={"x": torch.zeros(1)}, card="")
+
+
+def bad(tmp_path: Path, change) -> Path:
+    rows = frames()
+    change(rows)
+    return write_clip(tmp_path / "bad.txt", rows)
+
+
+def text(tmp_path: Path, content: str) -> Path:
+    path = tmp_path / "broken.txt"
+    path.write_text(content)
+    return path
+
+
+FIT = ("tokenize", "fit", "--preset", "tiny", "--clips")
+WRONG = {
+    "missing clip": (lambda p, c, r, t: (*FIT, p / "no.txt"), "no.txt: file: does not exist"),
+    "malformed clip": (lambda p, c, r, t: (*FIT, text(p, '{"Frames": [[0.1,')), "broken.txt: line 1: not JSON"),
+    "unknown format": (lambda p, c, r, t: (*FIT, text(p, "hello")), "broken.txt: first bytes: unknown format"),
+    "columns": (
+        lambda p, c, r, t: (*FIT, bad(p, lambda rows: rows[3].pop())),
+        "bad.txt: frame 3: 43 columns; the format has 44",
+    ),
+    "nan": (
+        lambda p, c, r, t: (*FIT, bad(p, lambda rows: rows[2].__setitem__(9, float("nan")))),
+        "bad.txt: frame 2, column 9: nan is not a finite number",
+    ),
+    "zero length": (
+        lambda p, c, r, t: (*FIT, bad(p, lambda rows: [row.__setitem__(0, 0.0) for row in rows])),
+        "bad.txt: Frames: fewer than two frames of positive duration",
+    ),
+    "one frame": (lambda p, c, r, t: (*FIT, bad(p, lambda rows: rows.__delitem__(slice(1, None)))), "at least two fr"),
+    "empty folder": (lambda p, c, r, t: (*FIT, p), "folder: holds no motion file"),
+    "same clip twice": (lambda p, c, r, t: (*FIT, c, "--clips", c), "two clips are named 'wave'; rename a file"),
+    "preset": (
+        lambda p, c, r, t: (*FIT, c, "--preset", "one-clp"),
+        "unknown preset 'one-clp'; one of: one-clip, many-clips, from-scratch, tiny; did you mean 'one-clip'?",
+    ),
+    "setting": (
+        lambda p, c, r, t: (*FIT, c, "--set", "teacher.sample=5"),
+        "config.teacher: unknown key 'sample'; one of: samples",
+    ),
+    "stage": (
+        lambda p, c, r, t: (*FIT, c, "--stages", "teacher,distil"),
+        "unknown stage 'distil'; did you mean 'distill'?",
+    ),
+    "tokens that do not divide": (
+        lambda p, c, r, t: (*FIT, c, "--set", "tokenizer.scalars=4"),
+        "cannot group 6 scalars by 4",
+    ),
+    "encode by another kind": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", gpt(p)),
+        "is a 'gpt'; a 'tokenizer' was asked for",
+    ),
+    "encode by a teacher": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", r / "teachers" / "wave"),
+        "a continuous tokenizer has no tokens",
+    ),
+    "unknown packaged name": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", "humanoid-fsk"),
+        "there is no directory humanoid-fsk",
+    ),
+    "encode no time": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", r, "--seconds", 0),
+        "0 seconds of clip 'wave' hold no control step",
+    ),
+    "decode a clip": (
+        lambda p, c, r, t: ("tokenize", "decode", c, "--tokenizer", r),
+        "humanoid3d_wave.txt is not a safetensors file",
+    ),
+    "decode by another tokenizer": (
+        lambda p, c, r, t: ("tokenize", "decode", t, "--tokenizer", r / ("ppo" if same(r, "distill") else "distill")),
+        "use the tokenizer that wrote them",
+    ),
+    "import nothing": (lambda p, c, r, t: ("clips", "import", p / "no.txt"), "no.txt: file: does not exist"),
+}
+
+
+def same(run: Path, stage: str) -> bool:
+    return load_artifact(run).hash == load_artifact(run / stage).hash
+
+
+@pytest.mark.parametrize(("args", "message"), WRONG.values(), ids=WRONG)
+def test_a_mistake_is_one_line_and_writes_nothing(args, message, tmp_path, clip, run, tokens):
+    words, out = args(tmp_path, clip, run, tokens), tmp_path / "new" / "out.safetensors"
+    result = kinetok(*words, "--out", out)
+    assert result.exit_code == 1
+    assert result.output.startswith("Error: ") and result.output.count("\n") == 1
+    assert message in result.output and "Traceback" not in result.output
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "allowed"),
+    [
+        (("clips", "import", "CLIP"), ".safetensors"),
+        (("tokenize", "encode", "CLIP", "--tokenizer", "RUN"), ".safetensors"),
+        (("tokenize", "decode", "TOKENS", "--tokenizer", "RUN"), ".safetensors or .mp4"),
+        (("sample",), ".mp4"),
+    ],
+)
+def test_the_suffix_is_judged_before_any_work(words, allowed, tmp_path):
+    result = kinetok(*words, "--out", tmp_path / "out.txt")
+    assert result.exit_code == 1
+    assert result.output == f"Error: --out {tmp_path / 'out.txt'}: the name must end in {allowed}\n"
+
+
+def test_a_file_where_a_folder_should_be_is_one_line(clip, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    result = kinetok(*FIT, clip, "--out", tmp_path / "taken" / "run")
+    assert result.exit_code == 1 and result.output.startswith("Error: ") and "taken" in result.output
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_a_traceback_can_be_had(tmp_path, monkeypatch):
+    monkeypatch.setenv("KINETOK_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="does not exist"):
+        kinetok("clips", "info", tmp_path / "no.txt")

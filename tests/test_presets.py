@@ -1,0 +1,77 @@
+import inspect
+import json
+
+import pytest
+
+from kinetok import presets
+from kinetok.config import ConfigError, from_dict, override, pick, to_dict
+from kinetok.tokenizers import TokenLayout
+
+TABLES = {name: table for name, table in vars(presets).items() if name.isupper() and isinstance(table, dict)}
+ALL = [pytest.param(build, id=f"{table}-{name}") for table, rows in TABLES.items() for name, build in rows.items()]
+
+
+def test_the_tables_hold_every_preset():
+    listed = {build for table in TABLES.values() for build in table.values()}
+    written = {
+        value
+        for name, value in vars(presets).items()
+        if inspect.isfunction(value) and value.__module__ == presets.__name__ and not name.startswith("_")
+    }
+    assert listed == written and all(build.__doc__ for build in listed)
+    assert all("tiny" in table for table in TABLES.values())
+
+
+@pytest.mark.parametrize("build", ALL)
+def test_it_builds_and_round_trips(build):
+    config = build()
+    assert from_dict(type(config), json.loads(json.dumps(to_dict(config)))) == config == build()
+
+
+@pytest.mark.parametrize("build", ALL)
+def test_a_misspelt_key_names_the_nearest(build):
+    config = build()
+    key = next(iter(to_dict(config)))
+    with pytest.raises(ConfigError, match=f"did you mean '{key}'"):
+        override(config, [f"{key}x=1"])
+
+
+@pytest.mark.parametrize("build", presets.FIT.values(), ids=presets.FIT)
+def test_the_student_has_tokens_and_sees_what_its_teachers_see(build):
+    config = build()
+    quantizer = config.tokenizer.quantizer
+    layout = TokenLayout.grouped(quantizer.dim, quantizer.levels, config.tokenizer.scalars)
+    assert layout.vocabulary < 100_000
+    assert set(config.teacher_tokenizer.future) <= set(config.tokenizer.future)
+    assert config.teacher.rows * config.teacher.ppo.horizon >= config.teacher.ppo.minibatch
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("teacher.sampels=3", "did you mean 'samples'"),
+        ("teacher.ppo.lrr=0.1", "did you mean 'lr'"),
+        ("tokenizer.quantizer.level=5", "did you mean 'levels'"),
+        ("tokenizer.quantizer.kind=fsk", "did you mean 'fsq'"),
+        ("techer.samples=3", "did you mean 'teacher'"),
+        ("teacher.samples=many", "expected int, not 'many'"),
+        ("teacher.samples", "write key=value"),
+    ],
+)
+def test_a_wrong_setting(assignment, message):
+    with pytest.raises(ConfigError, match=message):
+        override(presets.FIT["tiny"](), [assignment])
+
+
+def test_settings_reach_the_leaves():
+    config = override(
+        presets.FIT["one-clip"](),
+        ["teacher.samples=1500000", "tokenizer.quantizer.levels=5", "ppo.ppo.log_std=-3,-3.5", "stages=ppo"],
+    )
+    assert config.teacher.samples == 1_500_000 and config.tokenizer.quantizer.levels == 5
+    assert config.ppo.ppo.log_std == (-3.0, -3.5) and config.stages == ("ppo",)
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ConfigError, match=r"unknown preset 'one_clip'; one of: one-clip.*did you mean 'one-clip'"):
+        pick(presets.FIT, "one_clip", "preset")
