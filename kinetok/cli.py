@@ -128,7 +128,7 @@ def clips_info(paths: tuple[Path, ...]) -> None:
         steps = ((clip.qpos[1:, :2] - clip.qpos[:-1, :2]) ** 2).sum(1) ** 0.5
         click.echo(
             f"{clip.name:<22}{len(clip.qpos):>7}{clip.fps:>8.2f}{clip.seconds:>9.2f}{'yes' if clip.loop else 'no':>6}"
-            f"{low:>10.3f}{steps.sum():>8.2f}  {clip.source}"
+            f"{low:>z10.3f}{steps.sum():>8.2f}  {clip.source}"
         )
 
 

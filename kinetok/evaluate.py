@@ -44,7 +44,7 @@ def evaluate_tracking(
     push: float = 0.0,
     threads: int = 0,
 ) -> dict[str, Any]:
-    """Track every clip `episodes` times without noise; see tokenizers.track for episodes, success and error.
+    """Track every clip `episodes` times with mean actions; see tokenizers.track for episodes, success and error.
 
     Means over clips, and `clips` with the numbers of each. utilisation, perplexity: of each token position over all
     control steps, None for a continuous tokenizer. push: m/s at the root, every two seconds.

@@ -39,7 +39,7 @@ def frames(count: int = 16) -> list[list[float]]:
     rows = []
     for t in np.linspace(0, 1, count):
         half = 0.25 * np.sin(2 * np.pi * t)
-        limbs = [*identity, 0.0, *identity] + [*identity, 0.2] + [*identity, 0.0, *identity]
+        limbs = [*identity, 0.0, *identity, *identity, 0.2, *identity, 0.0, *identity]
         arm = [float(np.cos(half)), float(np.sin(half)), 0.0, 0.0, 0.2]
         rows.append([1 / 30, 0.0, 0.9, 0.0, *identity, *identity, *identity, *limbs, *arm])
     return rows

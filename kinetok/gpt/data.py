@@ -155,8 +155,8 @@ class Roaming(Tracking):
         if not len(ids):
             return
         frame = self.landing[ids]
-        self.clip[ids] = np.searchsorted(self.table.first, frame, side="right") - 1
-        self.frame[ids], self.landing[ids] = frame, -1
+        self.place(ids, np.searchsorted(self.table.first, frame, side="right") - 1, frame)
+        self.landing[ids] = -1
         place = self.table.root[frame, :2], self.table.heading[frame]
         env.sim.set_state(ids, *moved(env.sim.qpos[ids], env.sim.qvel[ids], *place))
         obs[ids] = self.observe(env.sim.state(ids), ids)

@@ -1,6 +1,6 @@
 """Plain networks: an MLP, and the actor with its critic."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import torch
@@ -30,7 +30,7 @@ class Actor(Protocol):
 
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]: ...
     def observe(self, obs: Tensor) -> None: ...
-    def parameters(self) -> "Sequence[nn.Parameter]": ...
+    def parameters(self) -> Iterable[nn.Parameter]: ...
 
 
 class Critic(nn.Module):

@@ -22,9 +22,11 @@ class World(Protocol):
     """rows worlds: step(action (N, A)) gives obs, reward, terminated, truncated, done ids and final_obs."""
 
     rows: int
-    obs_size: int
-    action_size: int
 
+    @property
+    def obs_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
     def step(self, action: np.ndarray) -> Any: ...
 
 

@@ -42,6 +42,11 @@ class BodyState:
             quat=self.quat[ids],
         )
 
+    def assign_(self, ids: np.ndarray, other: "BodyState") -> None:
+        """Overwrite rows ids with another state's rows."""
+        for name in ("pos", "mat", "linear", "angular", "quat"):
+            getattr(self, name)[ids] = getattr(other, name)
+
 
 class BatchSim:
     """`rows` simulations of one model on `threads` threads (0: all cores)."""

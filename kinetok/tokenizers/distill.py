@@ -87,7 +87,7 @@ def distill(
         evaluated = saved = step * config.rows
     # The memory is filled anew after every save, so that a resumed run and an unbroken one are the same.
     filled = cursor = 0
-    total = config.samples // config.rows
+    total = max(config.samples // config.rows, 1)
     with Logger(out, total=config.samples, title="distill", start=(step + 1) * config.rows, quiet=quiet) as log:
         obs = torch.from_numpy(env.reset(spread=True))
         while step < total:

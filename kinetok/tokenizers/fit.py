@@ -261,7 +261,7 @@ Turns a reference motion into codes and codes into joint torques, in physics at 
 - {tokens}quantizer `{to_dict(config.quantizer)}`.
 - Stages: {story}. Seed {seed}. Clips: {", ".join(names)}.
 
-## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, no noise
+## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, started with 0.01 rad of noise
 
 Success: largest body error of the episode below 0.5 m; mean form: mean body error below 0.5 m.
 

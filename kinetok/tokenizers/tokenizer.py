@@ -53,16 +53,20 @@ class TokenizerConfig:
         for part in (*self.encoder_inputs, *self.decoder_inputs):
             if part not in PARTS:
                 raise ConfigError(f"unknown observation part {part!r}; parts: {', '.join(PARTS)}")
-        leaks = self.residual or set(self.decoder_inputs) - {"state"}
-        if leaks and self.quantizer.kind != "continuous":
+        if self.quantizer.kind == "continuous":
+            return
+        if self.residual or self.decoder_inputs != ("state",):
             raise ConfigError(
                 f"a {self.quantizer.kind!r} tokenizer's decoder sees the state and the code only; residual actions and "
-                "decoder inputs beyond 'state' show it the reference; they are for continuous teachers"
+                "decoder inputs other than 'state' are for continuous teachers, which may see the reference"
             )
 
 
 class MotionTokenizer(nn.Module):
     """sizes: width of the observation's parts, as `sim.tasks.Tracking.layout` cuts it; actions: PD targets."""
+
+    action_mean: Tensor
+    action_scale: Tensor
 
     def __init__(self, config: TokenizerConfig, sizes: Mapping[str, int], actions: int):
         super().__init__()
@@ -119,7 +123,7 @@ class MotionTokenizer(nn.Module):
         return self._action(out), quantized.loss, quantized.metrics
 
     def _action(self, out: Tensor) -> Tensor:
-        return self.action_mean + self.action_scale * out  # type: ignore[operator]
+        return self.action_mean + self.action_scale * out
 
     def observe(self, obs: Tensor) -> None:
         """Merge observations into the normaliser."""

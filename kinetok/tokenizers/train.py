@@ -76,8 +76,10 @@ class Progress:
 
     @staticmethod
     def from_json(data: dict) -> "Progress":
-        score = data.get("score")
-        return Progress(**data | {"score": score and TrackingScore.from_json(score)})
+        progress = Progress(**{**data, "score": None})
+        if data.get("score"):
+            progress.score = TrackingScore.from_json(data["score"])
+        return progress
 
 
 def train_ppo(

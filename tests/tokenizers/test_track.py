@@ -28,8 +28,21 @@ def test_a_follower_of_a_standing_clip_succeeds(good):
     assert good.names == ("wave", "sweep") and good.episodes == 3
     assert (good.success == 1).all() and (good.success_mean_error == 1).all()
     assert (good.mpjpe_mm < 100).all()
-    # three episodes of a clip that ends: from frames 0, 5 and 10 of 30, so 30, 25 and 20 steps of 1/30 s
-    assert np.allclose(good.seconds, (30 + 25 + 20) / 3 / 30)
+    assert good.seconds.tolist() == [1.0, 1.0]  # every episode of a clip that ends runs from its first frame
+
+
+def test_episodes_of_one_clip_differ(standing, good):
+    once = track(Follow(standing.character.nu), standing, future=(1,), episodes=1)
+    assert (once.mpjpe_mm != good.mpjpe_mm).all()
+
+
+def test_a_loop_is_entered_at_phases_spread_over_it(wave):
+    """Jumping by 2 m at frame 10 of 30, a loop loses every episode there; only the phases tell how late."""
+    clip = wave("jump", 1.0, loop=True)
+    clip.qpos[10:, 0] += 2.0
+    score = track(Follow(28), ReferenceTable(ClipLibrary.of([clip]), seconds=2), future=(1,), episodes=2, seconds=1.5)
+    # the episode from frame 0 ends with its 10th step; that from frame 15 with its 25th, at frame 10 of the next cycle
+    assert score.seconds.tolist() == [(10 + 25) / 2 / 30] and score.success.tolist() == [0.0]
 
 
 def test_a_broken_body_scores_less(standing, good):

@@ -90,6 +90,7 @@ class Tracking:
         self.fixed, self.starts = fixed, starts
         self.clip = np.zeros(rows, dtype=int)
         self.frame = np.zeros(rows, dtype=int)
+        self.reference = table.body.rows(self.frame)  # where each row should be now
         self.error = np.zeros((rows, len(self.character.body_names)), dtype=np.float32)
         self._future = np.array(config.future)
         bodies = len(self.character.body_names)
@@ -115,32 +116,37 @@ class Tracking:
             offset = self.starts[ids]
         else:
             offset = (rng.random(len(ids)) * table.cycle[clip]).astype(int)
-        self.clip[ids] = clip
-        self.frame[ids] = table.first[clip] + offset
+        self.place(ids, clip, table.first[clip] + offset)
         return table.qpos[self.frame[ids]], table.qvel[self.frame[ids]]
+
+    def place(self, ids: np.ndarray, clip: np.ndarray, frame: np.ndarray) -> None:
+        """Let rows ids follow `clip` (n,) from table frame `frame` (n,) on."""
+        self.clip[ids], self.frame[ids] = clip, frame
+        self.reference.assign_(ids, self.table.body.rows(frame))
 
     def advance(self) -> None:
         """Time goes on by one control step."""
         self.frame = np.minimum(self.frame + 1, self.table.last[self.clip])
+        self.reference = self.table.body.rows(self.frame)
 
     def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
         """state | window | error | target (n, O) float32 of all rows or of rows ids."""
         table = self.table
-        frame, last = self.frame, table.last[self.clip]
+        frame, last, reference = self.frame, table.last[self.clip], self.reference
         if ids is not None:
-            frame, last = frame[ids], last[ids]
+            frame, last, reference = frame[ids], last[ids], reference.rows(ids)
         ahead = np.minimum(frame[:, None] + self._future, last[:, None])
         obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
         part = {name: obs[:, columns] for name, columns in self.layout.items()}
         observe.state_features(body, part["state"])
         observe.window_features(body, table.pose[ahead], table.root[ahead], table.heading[ahead], part["window"])
-        observe.error_features(body, table.body.rows(frame), part["error"])
+        observe.error_features(body, reference, part["error"])
         part["target"][:] = table.target[np.minimum(frame + 1, last)]
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """GPC eq. 8 against the frame the row should have reached."""
-        terms = tracking_reward(tracking_errors(body, self.table.body.rows(self.frame)), self.config.reward)
+        terms = tracking_reward(tracking_errors(body, self.reference), self.config.reward)
         return np.sum(list(terms.values()), axis=0), terms
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +154,7 @@ class Tracking:
 
         `error` keeps every body's distance (N, B) in metres from the reference, as it was before any reset.
         """
-        offset = body.pos - self.table.body.pos[self.frame]
+        offset = body.pos - self.reference.pos
         self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
         fine = (self.error.max(1) < self.config.fail_max) & (self.error.mean(1) < self.config.fail_mean)
         return ~fine, self.frame >= self.table.last[self.clip]
