@@ -121,7 +121,7 @@ def other_kind(tmp_path, student):
         (
             lambda **_: TokenizerConfig(decoder_inputs=("state", "window")),
             ConfigError,
-            "decoder inputs beyond 'state' show it the reference",
+            "decoder inputs other than 'state'",
         ),
         (
             lambda **_: TokenizerConfig(encoder_inputs=("windows",)),
