@@ -3,14 +3,19 @@
     python benchmarks/run.py                       # all of them
     python benchmarks/run.py env_step --json out.json
 
-A benchmark is a function (clip path) -> dict of plain numbers, registered in BENCHMARKS. Sides of a ratio are
+A benchmark is a function (clip path) -> dict of plain numbers, registered in BENCHMARKS; run alone, its figures stand
+at the top level of the JSON file, else under its name. Sides of a ratio are
 measured in turns and the median of the paired ratios is reported: rates drift on a shared machine, ratios far less.
 """
 
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads take the physics threads' cores
+
 import argparse
 import json
-import os
 import platform
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +25,13 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from kinetok import presets
+from kinetok.logger import read_metrics
 from kinetok.motion.formats import read_deepmimic
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.fit import fit
 
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "train" / "deepmimic" / "humanoid3d_walk.txt"
 
@@ -98,9 +106,52 @@ def env_step(clip: Path, rows: int, *, repetitions: int = 15, steps: int = 12) -
     }
 
 
-BENCHMARKS: dict[str, Callable[[Path], object]] = {
-    "env_step": lambda clip: [env_step(clip, rows) for rows in (512, 1024)],
-}
+def env_steps(clip: Path) -> dict[str, object]:
+    """The figures at 1,024 rows, and at fewer for comparison."""
+    return env_step(clip, 1024) | {"fewer_rows": env_step(clip, 512)}
+
+
+def reached(out: Path, stage: str, done: Callable[[dict], bool]) -> dict[str, float] | None:
+    """Minutes and samples of the first evaluation in a stage's log that satisfies `done`."""
+    for line in read_metrics(out / stage / "metrics.jsonl"):
+        if "track/success" in line and done(line):
+            return {"minutes": line["time"] / 60, "samples": line["step"]}
+    return None
+
+
+def one_clip(clip: Path, seeds: int = 3) -> dict[str, object]:
+    """A tokenizer of one walk from nothing: time and samples to 95 % of 20 s episodes, and to MPJPE below 40 mm.
+
+    The distilled student's time counts from the start of its teacher. Runs are kept in runs/bench-one-clip-SEED.
+    """
+    runs = []
+    for seed in range(seeds):
+        out = Path("runs") / f"bench-one-clip-{seed}"
+        shutil.rmtree(out, ignore_errors=True)
+        began = time.monotonic()
+        fit([read_deepmimic(clip)], presets.one_clip(), out, seed=seed)
+        total = (time.monotonic() - began) / 60
+        teacher = f"teachers/{read_deepmimic(clip).name}"
+        before = read_metrics(out / teacher / "metrics.jsonl")[-1]
+        run: dict[str, object] = {"seed": seed, "minutes": total, "teacher_samples": before["step"]}
+        run["teacher_95"] = reached(out, teacher, lambda line: line["track/success_mean_error"] >= 0.95)
+        for name, done in (
+            ("tokenizer_95", lambda line: line["track/success_mean_error"] >= 0.95),
+            ("tokenizer_40mm", lambda line: line["track/mpjpe_mm"] < 40 and line["track/success"] >= 0.95),
+        ):
+            found = reached(out, "distill", done)
+            run[name] = found and {
+                "minutes": before["time"] / 60 + found["minutes"],
+                "samples": before["step"] + found["samples"],
+            }
+        last = [line for line in read_metrics(out / "distill" / "metrics.jsonl") if "track/success" in line]
+        run["best_mpjpe_mm"] = min(line["track/mpjpe_mm"] for line in last)
+        print(json.dumps(run), flush=True)
+        runs.append(run)
+    return {"runs": runs}
+
+
+BENCHMARKS: dict[str, Callable[[Path], dict[str, object]]] = {"env_step": env_steps, "one_clip": one_clip}
 
 
 def main() -> None:
@@ -114,13 +165,15 @@ def main() -> None:
         parser.error(f"unknown benchmark {sorted(unknown)}; there are: {', '.join(BENCHMARKS)}")
     if not options.clip.exists():
         raise SystemExit(f"skipped: no clip at {options.clip}; give a DeepMimic walk with --clip")
+    names = options.names or list(BENCHMARKS)
     results: dict[str, object] = {
         "machine": {"cpus": os.cpu_count(), "load": os.getloadavg()[0], "python": platform.python_version()},
         "mujoco": mujoco.__version__,
     }
-    for name in options.names or BENCHMARKS:
-        results[name] = BENCHMARKS[name](options.clip)
-        print(f"{name}: {json.dumps(results[name], indent=2)}")
+    for name in names:
+        figures = BENCHMARKS[name](options.clip)
+        print(f"{name}: {json.dumps(figures, indent=2)}")
+        results |= figures if len(names) == 1 else {name: figures}
     if options.json:
         options.json.write_text(json.dumps(results, indent=2) + "\n")
 

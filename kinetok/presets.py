@@ -18,7 +18,19 @@ from kinetok.tokenizers.train import PPOStage
 
 def one_clip() -> FitConfig:
     """One motion in minutes on two cores: a small teacher, a small student, no polishing."""
-    return FitConfig(stages=("teacher", "distill"))
+    return FitConfig(
+        stages=("teacher", "distill"),
+        teacher=PPOStage(
+            samples=1_500_000,
+            eval_every=65_000,
+            eval_episodes=32,
+            stop_success=1.0,
+            stop_mpjpe_mm=32.0,
+            patience=6,
+            env=EnvConfig(reset_noise=0.01),
+        ),
+        distill=DistillStage(samples=150_000, eval_every=12_800, eval_episodes=32),
+    )
 
 
 def many_clips() -> FitConfig:

@@ -118,7 +118,7 @@ def from_mjcf(name: str, xml: str, roles: dict) -> Character:
             axis = u - ball[-1][1] if ball and ball[-1][0] == q else 0
             if axis > 2 or not np.array_equal(model.actuator_gear[u, :3], np.eye(3)[axis]):
                 raise ConfigError(
-                    f"character {name!r}: actuator {model.actuator(u).name!r} of a ball joint; such a joint needs three "
+                    f"character {name!r}: actuator {model.actuator(u).name!r} of a ball joint; that needs three "
                     'in a row, with gear "1 0 0", "0 1 0" and "0 0 1"'
                 )
             dof[u] = d + axis
