@@ -20,7 +20,7 @@ from kinetok.gpt.controller import Prior, roll
 from kinetok.metrics import mpjpe_mm
 from kinetok.motion.kinematics import kinematics
 from kinetok.motion.library import ClipLibrary
-from kinetok.render.video import render_frames, write_video
+from kinetok.render.video import render_frames, write_strip, write_video
 from kinetok.tokenizers.codec import decode_tokens, encode_clip
 
 CLIPS = PACKAGED / "clips.safetensors"
@@ -28,7 +28,7 @@ PRIOR = "humanoid-gpt"
 
 
 def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console | None = None) -> dict[str, float]:
-    """Write out/tracked.mp4 and out/sampled.mp4; returns the numbers of the table."""
+    """Write tracked.mp4, sampled.mp4 and sampled.png (stills) into `out`; returns the numbers of the table."""
     console = console or Console()
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
@@ -56,6 +56,7 @@ def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console
     best = int(np.argmax(np.linalg.norm(recording.pos[-1, :, 0, :2] - recording.pos[0, :, 0, :2], axis=-1)))
     frames = render_frames(body, recording.qpos[:, best], fps=fps, caption="sampled from the prior")
     write_video(out / "sampled.mp4", frames, fps)
+    write_strip(out / "sampled.png", body, recording.qpos[: 4 * fps, best], columns=8)
 
     sampled = measure(recording)
     numbers = {
