@@ -1,4 +1,4 @@
-"""The commands as a person types them; `--help` alone for those that need a trained prior."""
+"""The commands as a person types them, each eating the files of the one before."""
 
 import json
 import subprocess
@@ -160,6 +160,35 @@ def test_tokens_decode_to_the_motion_they_were_read_from(run, tokens, tmp_path):
     (motion,) = read_clips(out)
     assert motion.name == "wave" and motion.source == "simulated"
     assert np.abs(motion.qpos - TokenStream.load(tokens).simulated).max() < 1e-6  # a library keeps float32
+
+
+def test_a_prior_is_trained_sampled_and_measured_from_the_files_before_it(run, clip, tmp_path):
+    prior = tmp_path / "prior"
+    result = kinetok("pretrain", "--tokenizer", run, "--clips", clip, "--out", prior, "--preset", "tiny")
+    assert result.exit_code == 0, result.output
+    result = kinetok("evaluate", "prior", "--prior", prior, "--episodes", 4, "--seconds", 1, "--json", "prior.json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(Path("prior.json").read_text())
+    assert {"survival_rate", "seconds", "episodes", "apd_m", "accel_mps2", "jerk"} <= set(figures)
+    assert figures["episodes"] == 4 and figures["seconds"] == 1
+    result = kinetok("evaluate", "tracking", "--tokenizer", run, "--clips", clip, "--episodes", 2, "--json", "t.json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(Path("t.json").read_text())
+    assert {"success_rate", "success_rate_mean_error", "mpjpe_mm", "clips", "seed", "episodes"} <= set(figures)
+    assert figures["clips"][0]["name"] == "wave"
+
+
+def test_a_sample_is_a_video_a_clip_and_its_figures(run, clip, tmp_path):
+    pytest.importorskip("OpenGL")
+    prior = tmp_path / "prior"
+    assert kinetok("pretrain", "--tokenizer", run, "--clips", clip, "--out", prior, "--preset", "tiny").exit_code == 0
+    result = kinetok("sample", "--prior", prior, "--out", "new.mp4", "--seconds", 0.5, "--count", 2)
+    if "EGL" in result.output:
+        pytest.skip("no EGL on this machine: nothing can be drawn")
+    assert result.exit_code == 0, result.output
+    assert Path("new.mp4").stat().st_size > 1000
+    assert [len(c.qpos) for c in read_clips(Path("new.safetensors"))] == [15, 15]
+    assert json.loads(Path("new.json").read_text())["episodes"] == 2
 
 
 def gpt(path: Path) -> Path:
