@@ -132,8 +132,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     if "distill" in config.stages:
         teachers = [MotionTokenizer.from_pretrained(out / "teachers" / name) for name in names]
         parents = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in names}
-        story.append("distill")
-        told = " -> ".join(story)
+        story = ["teacher", "distill"]
         scores["distill"] = distill(
             student,
             teachers,
@@ -142,7 +141,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             out / "distill",
             seed=seed,
             threads=threads,
-            card=lambda score: tokenizer_card(student, names, told, seed, score),
+            card=lambda score: tokenizer_card(student, names, "teacher -> distill", seed, score),
             parents=parents,
         )
     if "ppo" in config.stages:
