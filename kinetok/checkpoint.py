@@ -242,6 +242,7 @@ def _write(path: Path, write: Callable[[Path], object]) -> str:
         with open(draft, "rb+") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
             os.fsync(file.fileno())
+        draft.chmod(0o644)  # safetensors makes files that only their owner can read
         os.replace(draft, path)
     finally:
         draft.unlink(missing_ok=True)

@@ -73,9 +73,7 @@ def test_the_hash_depends_on_the_tensors_only(tmp_path):
 def test_a_first_save_cut_short_can_be_repeated(tmp_path):
     save(tmp_path)
     (tmp_path / "config.json").unlink()
-    with pytest.raises(
-        CheckpointError, match=r"has no config\.json; it is not an artifact, or its first save"
-    ):
+    with pytest.raises(CheckpointError, match=r"has no config\.json; it is not an artifact, or its first save"):
         load_artifact(tmp_path)
     assert load_artifact(save(tmp_path)).kind == "gpt"
 
@@ -155,9 +153,7 @@ def test_a_file_is_no_place_for_an_artifact(tmp_path):
 def test_require_parent(tmp_path):
     artifact = load_artifact(save(tmp_path, parents={"tokenizer": "a" * 64}))
     require_parent(artifact, "tokenizer", "a" * 64, "runs/tok")
-    with pytest.raises(
-        CheckpointError, match="made with the tokenizer aaaaaaaaaaaa, but runs/tok is bbbbbbbbbbbb;"
-    ):
+    with pytest.raises(CheckpointError, match="made with the tokenizer aaaaaaaaaaaa, but runs/tok is bbbbbbbbbbbb;"):
         require_parent(artifact, "tokenizer", "b" * 64, "runs/tok")
     with pytest.raises(CheckpointError, match="records no parent 'tracker'; it records: tokenizer"):
         require_parent(artifact, "tracker", "a" * 64, "runs/tok")

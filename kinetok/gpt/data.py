@@ -213,6 +213,12 @@ def draw_starts(table: ReferenceTable, count: int, rng: np.random.Generator) -> 
     return Starts(qpos=table.qpos[frame], qvel=table.qvel[frame], clip=clip.astype(np.int64))
 
 
+def jitter(codes: Tensor, share: float, levels: int, rng: np.random.Generator) -> Tensor:
+    """Codes (N, D) of which a `share` is moved up or down by one level, within 0 .. levels - 1."""
+    shift = np.where(rng.random(codes.shape) < share, rng.choice([-1, 1], codes.shape), 0)
+    return (codes + torch.from_numpy(shift)).clamp(0, levels - 1)
+
+
 def before_failure(terminated: np.ndarray, done: np.ndarray, steps: int) -> np.ndarray:
     """Which of (T, N) control steps are among the last `steps` of an episode that failed.
 
@@ -234,11 +240,14 @@ def record(
     threads: int = 0,
     env: EnvConfig | None = None,
     transitions: float = 0.3,
+    code_noise: float = 0.0,
     quiet: bool = False,
 ) -> TokenDataset:
     """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
 
-    env: pushes, noise and episode length; the physics is the tokenizer's own. The result depends on `seed` and not
+    env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of the scalars whose
+    executed code is one level off while the recorded one is not, so that the data shows how to go on from the states
+    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). The result depends on `seed` and not
     on `threads`.
     """
     layout, scene = tokenizer.layout, tokenizer.config.scene
@@ -257,7 +266,8 @@ def record(
             seen = torch.from_numpy(obs)
             codes = tokenizer.encode(seen)
             states[t], tokens[t], clip[t] = seen[:, part], layout.to_tokens(codes), task.clip
-            step = world.step(tokenizer.decode(codes, seen[:, part]).numpy())
+            played = jitter(codes, code_noise, tokenizer.quantizer.levels[0], rng) if code_noise else codes
+            step = world.step(tokenizer.decode(played, seen[:, part]).numpy())
             terminated[t], done[t], obs = step.terminated, step.terminated | step.truncated, step.obs
             task.land(world, obs)
             if t % 20 == 19 or t == steps - 1:

@@ -41,14 +41,15 @@ from kinetok.tokenizers.tokenizer import MotionTokenizer
 THREADS = 2  # of torch, where none are asked for: one number everywhere keeps results the same everywhere
 EVAL_SAMPLES = 8192
 LOG_EVERY = 20
-RECORDING = ("samples", "rows", "transitions", "env")  # settings that decide the recorded data
+RECORDING = ("samples", "rows", "transitions", "code_noise", "env")  # settings that decide the recorded data
 
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
     """width, layers, heads, head, head_width, dropout: of the GPT (see GPTConfig).
 
-    samples: control steps to record. rows: worlds that record. transitions: changes of clip per second. env: pushes,
+    samples: control steps to record. rows: worlds that record. transitions: changes of clip per second. code_noise:
+    share of scalars whose executed code is one level off. env: pushes,
     noise and episodes of the recording.
     iterations of batch samples; lr falls by a cosine to lr_end after warmup iterations. weight_decay: of matrices.
     label_smoothing. ema: factor of the averaged weights. state_noise: standard deviations. held_out: share of worlds.
@@ -64,6 +65,7 @@ class PretrainConfig:
     samples: int = 400_000
     rows: int = 256
     transitions: float = 0.3
+    code_noise: float = 0.0
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.5)
     iterations: int = 3000
     batch: int = 512
@@ -287,6 +289,7 @@ def _recorded(
         threads=threads,
         env=config.env,
         transitions=config.transitions,
+        code_noise=config.code_noise,
         quiet=quiet,
     )
     data.save(path, identity | {"config": to_dict(config)})
@@ -330,7 +333,7 @@ frozen tokenizer {prior.tokenizer.hash[:12]} turns them into joint torques.
 - Input: proprioception ({prior.gpt.config.state_dim} numbers). Output: {layout.tokens_per_step} tokens from a
   vocabulary of {layout.vocabulary}. {size:,} parameters; `{to_dict(prior.gpt.config)}`.
 - Data: {len(data):,} control steps of the tracker's own roll-outs, pushes up to {config.env.push} m/s,
-  {config.transitions} changes of clip per second. Seed {seed}. Clips: {", ".join(prior.clips)}.
+  {config.transitions} changes of clip per second, code noise {config.code_noise}. Seed {seed}. Clips: {", ".join(prior.clips)}.
 - Training: {config.iterations} iterations of {config.batch}, AdamW {config.lr}, label smoothing
   {config.label_smoothing}, EMA {config.ema}, state noise {config.state_noise}.
 - It holds {len(prior.starts.qpos)} start states of the clips, so that it runs without them.

@@ -6,7 +6,17 @@ import torch
 from made import make_tokenizer
 
 from kinetok import rotation
-from kinetok.gpt.data import Roaming, Starts, TokenDataset, before_failure, clip_weights, likeness, moved, record
+from kinetok.gpt.data import (
+    Roaming,
+    Starts,
+    TokenDataset,
+    before_failure,
+    clip_weights,
+    jitter,
+    likeness,
+    moved,
+    record,
+)
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim.env import Env, EnvConfig
@@ -191,3 +201,11 @@ def test_transitions_happen_at_random_and_only_to_other_clips(humanoid):
         assert (task.clip[going] != clip[going]).all()
         moves += going.sum()
     assert 25 < moves < 80
+
+
+def test_jitter_moves_a_share_of_the_codes_by_one_level_within_range():
+    codes = torch.randint(0, 5, (2000, 6), generator=torch.Generator().manual_seed(0))
+    moved = jitter(codes, 0.3, 5, np.random.default_rng(0))
+    assert (moved - codes).abs().max() == 1 and moved.min() == 0 and moved.max() == 4
+    inner = (codes > 0) & (codes < 4)
+    assert (moved != codes)[inner].float().mean().item() == pytest.approx(0.3, abs=0.02)
