@@ -247,8 +247,8 @@ def record(
 
     env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of the scalars whose
     executed code is one level off while the recorded one is not, so that the data shows how to go on from the states
-    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). The result depends on `seed` and not
-    on `threads`.
+    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). The result
+    depends on `seed` and not on `threads`.
     """
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 1])

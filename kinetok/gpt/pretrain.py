@@ -333,7 +333,8 @@ frozen tokenizer {prior.tokenizer.hash[:12]} turns them into joint torques.
 - Input: proprioception ({prior.gpt.config.state_dim} numbers). Output: {layout.tokens_per_step} tokens from a
   vocabulary of {layout.vocabulary}. {size:,} parameters; `{to_dict(prior.gpt.config)}`.
 - Data: {len(data):,} control steps of the tracker's own roll-outs, pushes up to {config.env.push} m/s,
-  {config.transitions} changes of clip per second, code noise {config.code_noise}. Seed {seed}. Clips: {", ".join(prior.clips)}.
+  {config.transitions} changes of clip per second, code noise {config.code_noise}. Seed {seed}.
+- Clips: {", ".join(prior.clips)}.
 - Training: {config.iterations} iterations of {config.batch}, AdamW {config.lr}, label smoothing
   {config.label_smoothing}, EMA {config.ema}, state noise {config.state_noise}.
 - It holds {len(prior.starts.qpos)} start states of the clips, so that it runs without them.
