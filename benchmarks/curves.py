@@ -1,6 +1,6 @@
 """Plot what a training logged: success and error of its evaluations over samples, one line per run.
 
-    python benchmarks/curves.py runs/a/distill runs/b/distill --out docs/curves.png
+python benchmarks/curves.py runs/a/distill runs/b/distill --out docs/curves.png
 """
 
 import argparse
