@@ -23,6 +23,7 @@ from pathlib import Path
 import gymnasium
 import mujoco
 import numpy as np
+import torch
 from mujoco.batch import Batch
 
 from kinetok import presets
@@ -32,6 +33,7 @@ from kinetok.motion.library import ClipLibrary
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.fit import fit
+from kinetok.tokenizers.tokenizer import MotionTokenizer
 
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "train" / "deepmimic" / "humanoid3d_walk.txt"
 
@@ -43,15 +45,16 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def env_step(clip: Path, rows: int, *, repetitions: int = 15, steps: int = 12) -> dict[str, float]:
+def env_step(clip: Path, rows: int, *, steps: int = 150, skip: int = 20) -> dict[str, float]:
     """Env.step (physics, observation, reward, resets) against Batch.step alone, and against Gymnasium's loop.
 
-    Both sides step the same model, threads and substeps under the same controls, the reference's PD targets with
-    noise; before each repetition the raw batch starts from the environment's own states. The default encoder window
-    of seven future frames is observed; 10 s episodes keep their resets in the measurement.
+    The packaged tokenizer drives the worlds, so that they walk as they do in training; its own time is not counted.
+    At every control step the raw batch of the same model, threads and substeps starts from the same states under the
+    same controls. The default window of seven future frames is observed; 10 s episodes keep resets in the figures.
     """
+    tokenizer = MotionTokenizer.from_pretrained("humanoid-fsq")
     table = ReferenceTable(ClipLibrary.of([read_deepmimic(clip)]))
-    task = Tracking(TrackingConfig(), table, rows=rows)
+    task = Tracking(TrackingConfig(future=tokenizer.config.future), table, rows=rows)
     config = EnvConfig()
     env = Env(config, task, rows=rows)
     raw = Batch(env.sim.model, rows)
@@ -59,24 +62,8 @@ def env_step(clip: Path, rows: int, *, repetitions: int = 15, steps: int = 12) -
     gym = gymnasium.make("Humanoid-v5")
     gym.reset(seed=0)
     gym.action_space.seed(0)
-    gym_actions = [gym.action_space.sample() for _ in range(100)]
-    rng, substeps = np.random.default_rng(0), config.scene.substeps
-    env.reset(spread=True)
+    gym_actions = [gym.action_space.sample() for _ in range(20)]
     finished, samples = 0, []
-
-    def controls(ahead: int) -> np.ndarray:
-        frame = np.minimum(task.frame + ahead, table.last[task.clip])
-        return table.target[frame] + 0.05 * rng.standard_normal((rows, env.action_size), dtype=np.float32)
-
-    def step_env(actions: list[np.ndarray]) -> None:
-        nonlocal finished
-        for action in actions:
-            finished += len(env.step(action).done)
-
-    def step_raw(actions: list[np.ndarray]) -> None:
-        for action in actions:
-            state["ctrl"][:] = action
-            raw.step(nstep=substeps)
 
     def step_gym() -> None:
         for action in gym_actions:
@@ -84,24 +71,28 @@ def env_step(clip: Path, rows: int, *, repetitions: int = 15, steps: int = 12) -
             if terminated or truncated:
                 gym.reset()
 
-    for repetition in range(repetitions + 2):  # the first two warm caches and let episodes spread
-        actions = [controls(1 + k) for k in range(steps)]
+    obs = env.reset(spread=True)
+    for index in range(steps + skip):
+        with torch.no_grad():
+            action = tokenizer.act(torch.from_numpy(obs))[0].numpy()
         state["qpos"][:], state["qvel"][:], state["qacc_warmstart"][:] = env.sim.qpos, env.sim.qvel, 0
-        pair = [(step_raw, actions), (step_env, actions)]
-        times = {
-            work: seconds(lambda work=work, given=given: work(given)) for work, given in pair[:: (-1) ** repetition]
-        }
-        samples.append((times[step_raw], times[step_env], seconds(step_gym) / len(gym_actions)))
-    raw_s, env_s, gym_s = np.array(samples[2:]).T
-    count = rows * steps
+        state["ctrl"][:] = action
+        before = seconds(lambda: raw.step(nstep=config.scene.substeps)) if index % 2 else None
+        begin = time.perf_counter()
+        step = env.step(action)
+        took = time.perf_counter() - begin
+        after = before or seconds(lambda: raw.step(nstep=config.scene.substeps))
+        obs, finished = step.obs, finished + len(step.done)
+        samples.append((after, took, seconds(step_gym) / len(gym_actions)))
+    raw_s, env_s, gym_s = np.array(samples[skip:]).T
     return {
         "rows": rows,
         "observation": env.obs_size,
-        "env_steps_per_second": count / float(np.median(env_s)),
-        "raw_steps_per_second": count / float(np.median(raw_s)),
+        "env_steps_per_second": rows / float(np.median(env_s)),
+        "raw_steps_per_second": rows / float(np.median(raw_s)),
         "gymnasium_steps_per_second": 1 / float(np.median(gym_s)),
         "ratio_to_raw": float(np.median(raw_s / env_s)),
-        "ratio_to_gymnasium": float(np.median(gym_s * count / env_s)),
+        "ratio_to_gymnasium": float(np.median(gym_s * rows / env_s)),
         "episodes_finished": finished,
     }
 
