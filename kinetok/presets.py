@@ -53,7 +53,7 @@ def from_scratch() -> FitConfig:
     """The paper's form: end-to-end PPO through the bottleneck from random weights, nothing else."""
     return FitConfig(
         stages=("ppo",),
-        ppo=PPOStage(samples=8_000_000, ppo=PPOConfig(log_std=(-2.3, -2.9)), stop_success=1.0, stop_mpjpe_mm=40.0),
+        ppo=PPOStage(samples=8_000_000, log_std=(-2.3, -2.9), stop_success=1.0, stop_mpjpe_mm=40.0),
     )
 
 

@@ -66,10 +66,10 @@ def test_a_wrong_setting(assignment, message):
 def test_settings_reach_the_leaves():
     config = override(
         presets.FIT["one-clip"](),
-        ["teacher.samples=1500000", "tokenizer.quantizer.levels=5", "ppo.ppo.log_std=-3,-3.5", "stages=ppo"],
+        ["teacher.samples=1500000", "tokenizer.quantizer.levels=5", "ppo.log_std=-3,-3.5", "stages=ppo"],
     )
     assert config.teacher.samples == 1_500_000 and config.tokenizer.quantizer.levels == 5
-    assert config.ppo.ppo.log_std == (-3.0, -3.5) and config.stages == ("ppo",)
+    assert config.ppo.log_std == (-3.0, -3.5) and config.stages == ("ppo",)
 
 
 def test_an_unknown_preset_names_the_nearest():

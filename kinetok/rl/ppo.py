@@ -1,12 +1,11 @@
-"""Proximal policy optimisation (Schulman et al. 2017) of a Gaussian policy with a scheduled spread.
+"""Proximal policy optimisation (Schulman et al. 2017) of any policy that fits policy.py.
 
-    optimizers = Optimizers(actor, critic, config)
-    metrics = update(actor, critic, optimizers, rollout, advantages, targets, config, log_std=-2.6, generator=g)
+    optimizers = Optimizers(policy, critic, config)
+    metrics = update(policy, critic, optimizers, rollout, advantages, targets, config, generator=g)
 
-The actor's learning rate follows the measured KL divergence (halfway between the rules of Schulman's adaptive
+The policy's learning rate follows the measured KL divergence (halfway between the rules of Schulman's adaptive
 KL and rsl_rl): it shrinks when a minibatch moves the policy further than twice `target_kl`, and grows below
-half of it. An actor's auxiliary loss (a quantizer's) is added as it is. `anchor` pulls the policy towards the
-means of a frozen one, in units of the noise.
+half of it. What the policy adds as a loss of its own (a quantizer's, an anchor's, an entropy) is added as it is.
 """
 
 from dataclasses import dataclass
@@ -14,14 +13,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from kinetok.rl.nets import Actor, Critic
+from kinetok.rl.nets import Critic
+from kinetok.rl.policy import Policy
 from kinetok.rl.rollout import Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
-    """horizon: steps per rollout; log_std: spread at the first and at the last iteration; lr: starting rate of the
-    actor, lr_max: its ceiling; target_kl: the divergence per update it aims at."""
+    """horizon: steps per rollout; lr: starting rate of the policy, lr_max: its ceiling; target_kl: the divergence per
+    update it aims at."""
 
     horizon: int = 16
     epochs: int = 3
@@ -33,18 +33,16 @@ class PPOConfig:
     lr_max: float = 1e-3
     critic_lr: float = 1e-3
     target_kl: float = 0.03
-    log_std: tuple[float, float] = (-2.6, -2.9)
     max_grad_norm: float = 1.0
-    anchor: float = 0.0
 
 
 class Optimizers:
-    """Adam for the actor and for the critic, and the actor's adaptive rate."""
+    """Adam for the policy ("actor") and for the critic, and the policy's adaptive rate."""
 
-    def __init__(self, actor: nn.Module, critic: nn.Module, config: PPOConfig):
-        fused = next(actor.parameters()).device.type == "cpu"
-        self.actor = torch.optim.Adam(actor.parameters(), lr=config.lr, fused=fused)
-        self.critic = torch.optim.Adam(critic.parameters(), lr=config.critic_lr, fused=fused)
+    def __init__(self, policy: Policy | nn.Module, critic: nn.Module, config: PPOConfig):
+        self.parameters = [p for p in policy.parameters() if p.requires_grad]
+        self.actor = torch.optim.Adam(self.parameters, lr=config.lr, fused=True)
+        self.critic = torch.optim.Adam(critic.parameters(), lr=config.critic_lr, fused=True)
         self.range = (1e-5, config.lr_max)
 
     @property
@@ -71,7 +69,7 @@ def surrogate(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
 
 
 def update(
-    actor: Actor,
+    policy: Policy,
     critic: Critic,
     optimizers: Optimizers,
     rollout: Rollout,
@@ -79,41 +77,28 @@ def update(
     targets: Tensor,
     config: PPOConfig,
     *,
-    log_std: float,
     generator: torch.Generator,
     train_actor: bool = True,
-    anchor: Actor | None = None,
 ) -> dict[str, float]:
     """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics.
 
     Raises FloatingPointError before any parameter moves by a loss that is not finite.
     """
-    obs, actions, means = (x.flatten(0, 1) for x in (rollout.obs, rollout.actions, rollout.means))
-    precision = float(torch.exp(torch.tensor(-2.0 * log_std)))
+    obs, taken = rollout.obs.flatten(0, 1), {name: x.flatten(0, 1) for name, x in rollout.taken.items()}
     advantages, targets = advantages.flatten(), targets.flatten()
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-6)
-    old_log_prob = -0.5 * precision * ((actions - means) ** 2).sum(-1)
     sums: dict[str, Tensor] = {}
     steps = 0
     for _ in range(config.epochs):
         for ids in torch.randperm(len(obs), generator=generator).split(config.minibatch):
-            batch = obs[ids]
-            value_loss = (critic(batch) - targets[ids]).pow(2).mean()
+            value_loss = (critic(obs[ids]) - targets[ids]).pow(2).mean()
             metrics: dict[str, Tensor] = {"value_loss": value_loss}
             loss = value_loss
             if train_actor:
-                mean, auxiliary, extra = actor.act(batch)
-                log_prob = -0.5 * precision * ((actions[ids] - mean) ** 2).sum(-1)
-                policy_loss = surrogate(log_prob - old_log_prob[ids], advantages[ids], config.clip)
-                kl = 0.5 * precision * (mean.detach() - means[ids]).pow(2).sum(-1).mean()
-                loss = loss + policy_loss + auxiliary
-                metrics |= {"policy_loss": policy_loss, "kl": kl, **extra}
-                if anchor is not None and config.anchor:
-                    with torch.no_grad():
-                        target = anchor.act(batch)[0]
-                    pull = 0.5 * precision * (mean - target).pow(2).sum(-1).mean()
-                    loss = loss + config.anchor * pull
-                    metrics["anchor"] = pull
+                judged = policy.assess(obs[ids], {name: x[ids] for name, x in taken.items()})
+                policy_loss = surrogate(judged.log_prob - taken["log_prob"][ids], advantages[ids], config.clip)
+                loss = loss + policy_loss + judged.loss
+                metrics |= {"policy_loss": policy_loss, "kl": judged.kl, **judged.metrics}
             if not torch.isfinite(loss):
                 raise FloatingPointError(f"loss is {loss.item()}")
             optimizers.actor.zero_grad(set_to_none=True)
@@ -122,7 +107,7 @@ def update(
             nn.utils.clip_grad_norm_(critic.parameters(), config.max_grad_norm)
             optimizers.critic.step()
             if train_actor:
-                nn.utils.clip_grad_norm_(actor.parameters(), config.max_grad_norm)
+                nn.utils.clip_grad_norm_(optimizers.parameters, config.max_grad_norm)
                 optimizers.actor.step()
                 optimizers.adapt(float(metrics["kl"]), config.target_kl)
             for name, value in metrics.items():

@@ -1,6 +1,6 @@
-"""Collect experience: T steps of N worlds under a policy with Gaussian noise.
+"""Collect experience: T steps of N worlds under a policy.
 
-    rollout = collect(world, actor, critic, horizon=16, log_std=-2.6, generator=g)
+    rollout = collect(world, policy, critic, obs, horizon=16, generator=g)
 
 `World` is what `sim.Env` fits by shape. Torch runs on one thread here: the physics threads need the cores, and
 one thread makes the states independent of the thread count.
@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.rl.nets import Actor, Critic
+from kinetok.rl.nets import Critic
+from kinetok.rl.policy import Policy
 
 
 class World(Protocol):
@@ -32,12 +33,11 @@ class World(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Rollout:
-    """(T, N, ...) tensors: obs, actions, means, rewards; values of obs, next_values before resets (zero where
-    terminal), done. last_obs (N, O) is where the next rollout begins."""
+    """(T, N, ...) tensors: obs; taken, what the policy drew; rewards; values of obs, next_values before resets (zero
+    where terminal), done. last_obs (N, O) is where the next rollout begins."""
 
     obs: Tensor
-    actions: Tensor
-    means: Tensor
+    taken: dict[str, Tensor]
     rewards: Tensor
     values: Tensor
     next_values: Tensor
@@ -58,21 +58,21 @@ def torch_threads(count: int) -> Iterator[None]:
 
 @torch.no_grad()
 def collect(
-    world: World, actor: Actor, critic: Critic, obs: Tensor, *, horizon: int, log_std: float, generator: torch.Generator
+    world: World, policy: Policy, critic: Critic, obs: Tensor, *, horizon: int, generator: torch.Generator
 ) -> Rollout:
     """Step `world` from observations obs (N, O) for `horizon` steps."""
-    n, std = world.rows, float(np.exp(log_std))
+    n = world.rows
     all_obs = torch.empty(horizon + 1, n, world.obs_size)
-    actions, means = torch.empty(horizon, n, world.action_size), torch.empty(horizon, n, world.action_size)
     rewards, done = torch.empty(horizon, n), torch.zeros(horizon, n, dtype=torch.bool)
     terminal = torch.zeros(horizon, n, dtype=torch.bool)
+    taken: list[dict[str, Tensor]] = []
     finals: list[tuple[int, np.ndarray, Tensor]] = []
     all_obs[0] = obs
     with torch_threads(1):
         for t in range(horizon):
-            means[t] = actor.act(all_obs[t])[0]
-            actions[t] = means[t] + std * torch.randn(means[t].shape, generator=generator)
-            step = world.step(actions[t].numpy())
+            action, drawn = policy.draw(all_obs[t], generator)
+            taken.append(drawn)
+            step = world.step(action.numpy())
             all_obs[t + 1] = torch.from_numpy(step.obs)
             rewards[t] = torch.from_numpy(step.reward)
             terminal[t] = torch.from_numpy(step.terminated)
@@ -88,8 +88,7 @@ def collect(
     next_values[terminal] = 0
     return Rollout(
         obs=all_obs[:-1],
-        actions=actions,
-        means=means,
+        taken={name: torch.stack([drawn[name] for drawn in taken]) for name in taken[0]},
         rewards=rewards,
         values=values[:-1],
         next_values=next_values,

@@ -53,8 +53,10 @@ def _polish() -> PPOStage:
     return PPOStage(
         samples=1_000_000,
         critic_warmup=10,
+        log_std=(-3.2, -3.2),
+        anchor=0.02,
         env=EnvConfig(reset_noise=0.02, push=0.5),
-        ppo=PPOConfig(log_std=(-3.2, -3.2), lr=5e-5, lr_max=2e-4, target_kl=0.01, anchor=0.02),
+        ppo=PPOConfig(lr=5e-5, lr_max=2e-4, target_kl=0.01),
     )
 
 

@@ -4,7 +4,7 @@
 
 One function for both uses: a *teacher* (continuous code, residual action) from nothing, and the tokenizer itself
 end to end, gradients straight through the bottleneck, from nothing (the paper's form) or from a distilled start.
-From a start the critic learns first (`critic_warmup`), and the policy may be held near its start (`ppo.anchor`).
+From a start the critic learns first (`critic_warmup`), and the policy may be held near its start (`anchor`).
 
 `out` receives metrics.jsonl, the best artifact by `track`, and state.safetensors: a later call with the same
 configuration goes on bit for bit where that state was written; a changed one is refused, saying what changed.
@@ -24,10 +24,12 @@ from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state,
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.logger import Logger
 from kinetok.rl.nets import Critic
+from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
 from kinetok.rl.rollout import Rollout, collect
 from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.reward import TrackingReward
 from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
@@ -39,7 +41,8 @@ class PPOStage:
     """samples: control steps to train for; rows: worlds; eval_every: samples between evaluations of `eval_episodes`
     episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; patience: or when, with
     stop_success reached, the best score is so many evaluations old; critic_warmup: first
-    iterations that leave the policy alone; fail_mean: training's termination, metres of mean body error."""
+    iterations that leave the policy alone; log_std: spread of the actions at the first and the last iteration;
+    anchor: pull towards the policy it started from; fail_mean: training's termination, metres of mean body error."""
 
     samples: int = 2_000_000
     rows: int = 512
@@ -50,7 +53,10 @@ class PPOStage:
     patience: int = 1000
     critic: tuple[int, ...] = (256, 128)
     critic_warmup: int = 0
+    log_std: tuple[float, float] = (-2.6, -2.9)
+    anchor: float = 0.0
     fail_mean: float = 0.3
+    reward: TrackingReward = TrackingReward()
     env: EnvConfig = EnvConfig()
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
@@ -96,13 +102,16 @@ def train_ppo(
 ) -> TrackingScore:
     """Train `actor` in place; returns the score of the best artifact, which lies in `out`."""
     future, scene = actor.config.future, actor.config.scene
-    task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
+    task = Tracking(
+        TrackingConfig(future=future, fail_mean=config.fail_mean, reward=config.reward), table, rows=config.rows
+    )
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     torch.manual_seed(seed)
     critic = Critic(env.obs_size, config.critic, actor.config.activation)
     optimizers = Optimizers(actor, critic, config.ppo)
     generator = torch.Generator().manual_seed(seed)
-    anchor = copy.deepcopy(actor) if config.ppo.anchor else None
+    anchor = copy.deepcopy(actor) if config.anchor else None
+    policy = Gaussian(actor, config.log_std[0], anchor, config.anchor)
     identity = identify(config, actor.config, table.names, seed)
     run = _Run(out, actor, critic, optimizers, generator, env, anchor, identity)
     progress = run.resume()
@@ -116,11 +125,11 @@ def train_ppo(
         obs = torch.from_numpy(env.reset(spread=True))
         while not progress.finished(config):
             share = min(progress.samples / config.samples, 1.0)
-            log_std = config.ppo.log_std[0] + share * (config.ppo.log_std[1] - config.ppo.log_std[0])
-            rollout = collect(env, actor, critic, obs, horizon=config.ppo.horizon, log_std=log_std, generator=generator)
+            policy.log_std = config.log_std[0] + share * (config.log_std[1] - config.log_std[0])
+            rollout = collect(env, policy, critic, obs, horizon=config.ppo.horizon, generator=generator)
             obs = rollout.last_obs
             if progress.iteration > 0:
-                metrics = _learn(run, rollout, config.ppo, log_std, progress.iteration > config.critic_warmup)
+                metrics = _learn(run, policy, rollout, config.ppo, progress.iteration > config.critic_warmup)
             else:
                 metrics = {}  # the first rollout only sets the normalisers
             if not (progress.iteration == 0 and float(actor.norm.count) > 0):
@@ -217,23 +226,21 @@ class _Run:
         return Progress.from_json(meta["progress"])
 
 
-def _learn(run: _Run, rollout: Rollout, config: PPOConfig, log_std: float, train_actor: bool) -> dict[str, float]:
+def _learn(run: _Run, policy: Gaussian, rollout: Rollout, config: PPOConfig, train_actor: bool) -> dict[str, float]:
     try:
         advantages, targets = gae(
             rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
         )
         metrics = update(
-            run.actor,
+            policy,
             run.critic,
             run.optimizers,
             rollout,
             advantages,
             targets,
             config,
-            log_std=log_std,
             generator=run.generator,
             train_actor=train_actor,
-            anchor=run.anchor,
         )
         # The last minibatch's gradient has no later loss that would show it.
         finite = [torch.isfinite(p).all() for net in (run.actor, run.critic) for p in net.parameters()]
@@ -241,11 +248,11 @@ def _learn(run: _Run, rollout: Rollout, config: PPOConfig, log_std: float, train
             raise FloatingPointError(f"parameters or metrics are not finite: {metrics}")
     except FloatingPointError as error:
         dump = run.out / "bad_rollout.safetensors"
-        save_state(dump, {"obs": rollout.obs, "actions": rollout.actions, "rewards": rollout.rewards}, {})
+        save_state(dump, {"obs": rollout.obs, "rewards": rollout.rewards, **rollout.taken}, {})
         raise FloatingPointError(
             f"{error}; training stopped. The rollout is in {dump}; the last good state in {run.path} is untouched. "
             "Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
         ) from error
     metrics["failed_simulations"] = run.env.failed_simulations
-    metrics["log_std"] = log_std
+    metrics["log_std"] = policy.log_std
     return metrics

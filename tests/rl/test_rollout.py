@@ -5,6 +5,7 @@ import torch
 from toy import Aim, Line
 
 from kinetok.rl.nets import Critic
+from kinetok.rl.policy import Gaussian
 from kinetok.rl.rollout import collect, torch_threads
 
 T, N = 6, 3
@@ -20,15 +21,15 @@ def roll(critic, world=None, log_std=-1.0, seed=0, actor=None):
     world = world or Aim(N, length=4, mortal=(1,))
     generator = torch.Generator().manual_seed(seed)
     obs = torch.from_numpy(world.obs.copy())
-    return world, collect(world, actor or Line(), critic, obs, horizon=T, log_std=log_std, generator=generator)
+    return world, collect(world, Gaussian(actor or Line(), log_std), critic, obs, horizon=T, generator=generator)
 
 
 def test_shapes_and_what_the_world_was_given(critic):
     world, rollout = roll(critic)
-    assert rollout.obs.shape == (T, N, 2) and rollout.actions.shape == rollout.means.shape == (T, N, 1)
+    assert rollout.obs.shape == (T, N, 2) and rollout.taken["action"].shape == rollout.taken["mean"].shape == (T, N, 1)
     assert [x.shape for x in (rollout.rewards, rollout.values, rollout.next_values, rollout.done)] == [(T, N)] * 4
-    torch.testing.assert_close(rollout.actions, torch.tensor([a.tolist() for a in world.taken]))
-    reward = -((rollout.actions - 2 * rollout.obs[..., :1]) ** 2)[..., 0]
+    torch.testing.assert_close(rollout.taken["action"], torch.tensor([a.tolist() for a in world.taken]))
+    reward = -((rollout.taken["action"] - 2 * rollout.obs[..., :1]) ** 2)[..., 0]
     torch.testing.assert_close(rollout.rewards, reward)
     torch.testing.assert_close(rollout.last_obs, torch.from_numpy(world.obs))
     assert not rollout.values.requires_grad
@@ -50,13 +51,15 @@ def test_ends(critic):
 
 def test_noise_has_the_spread_asked_for(critic):
     _, rollout = roll(critic, world=Aim(2000), log_std=-0.7)
-    assert (rollout.actions - rollout.means).std().item() == pytest.approx(0.4966, rel=0.03)  # e^-0.7
+    assert (rollout.taken["action"] - rollout.taken["mean"]).std().item() == pytest.approx(0.4966, rel=0.03)  # e^-0.7
 
 
 def test_one_seed_is_one_rollout(critic):
     first, again, other = (roll(critic, seed=s)[1] for s in (0, 0, 1))
-    assert torch.equal(first.actions, again.actions) and torch.equal(first.next_values, again.next_values)
-    assert not torch.equal(first.actions, other.actions)
+    assert torch.equal(first.taken["action"], again.taken["action"]) and torch.equal(
+        first.next_values, again.next_values
+    )
+    assert not torch.equal(first.taken["action"], other.taken["action"])
 
 
 def test_threads_are_given_back():

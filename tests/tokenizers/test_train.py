@@ -25,7 +25,7 @@ def config(small) -> PPOStage:
     """Four iterations, the last three of which learn, and evaluations after the second and the fourth; everything
     that draws random numbers is on."""
     env = EnvConfig(reset_noise=0.02, push=0.5, friction=(0.8, 1.2), episode_seconds=0.5)
-    return replace(small.ppo, env=env, ppo=replace(small.ppo.ppo, anchor=0.1))
+    return replace(small.ppo, env=env, anchor=0.1)
 
 
 @pytest.fixture(scope="module")
