@@ -1,18 +1,19 @@
 """Draw poses of a character and write them as a video or as a strip of stills.
 
     frames = render_frames(humanoid, qpos, fps=30, ghost=reference, caption="walk")
+    frames = render_frames(humanoid, qpos, fps=30, markers=markers, distance=6.0, elevation=-25.0)
     write_video(Path("walk.mp4"), frames, fps=30)
     write_strip(Path("walk.png"), humanoid, qpos)
 
 The camera follows the root, smoothed, from three quarters in front. `ghost` is a second sequence of poses drawn
-translucent in the same place. Without a display MuJoCo draws through EGL (see kinetok/__init__.py); where that
-library is missing, RenderError names the package. Shadows are flat discs below the limbs: half of the drawing time
-of a software renderer would go into a shadow map.
+translucent in the same place; `markers` show what a task asks for (sim.tasks.marker). Without a display MuJoCo
+draws through EGL (see kinetok/__init__.py); where that library is missing, RenderError names the package. Shadows
+are flat discs below the limbs: half of the drawing time of a software renderer would go into a shadow map.
 """
 
 import os
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,6 +25,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.character import Character
 from kinetok.sim.scene import SceneConfig, scene_spec
+from kinetok.sim.tasks.marker import Marker
 
 GHOST = (0.96, 0.56, 0.20, 0.38)
 SKY, HAZE = (0.55, 0.68, 0.84), (0.90, 0.93, 0.96)
@@ -45,16 +47,22 @@ def render_frames(
     size: tuple[int, int] = (640, 360),
     ghost: np.ndarray | None = None,
     caption: str = "",
+    markers: Sequence[Sequence[Marker]] | None = None,
+    distance: float = DISTANCE,
+    elevation: float = ELEVATION,
 ) -> Iterator[np.ndarray]:
     """Draw poses qpos (T, nq), given at fps frames per second, as images (H, W, 3) uint8; size is (width, height).
 
-    ghost (T, nq) is drawn translucent over them; caption is written in the upper left corner.
+    ghost (T, nq) is drawn translucent over them; caption is written in the upper left corner; markers: those of each
+    frame; distance, elevation: metres and degrees of the camera from the root.
     """
     for name, poses in (("qpos", qpos), ("ghost", ghost)):
         if poses is not None and (poses.ndim != 2 or poses.shape[1] != character.nq or len(poses) != len(qpos)):
             wanted = f"({len(qpos) if name == 'ghost' else 'T'}, {character.nq})"
             raise ValueError(f"{name} has shape {poses.shape}; {character.name!r} needs {wanted}")
-    return _render(character, qpos, _cameras(qpos, fps), size, ghost, caption)
+    if markers is not None and len(markers) != len(qpos):
+        raise ValueError(f"markers are given for {len(markers)} frames, qpos for {len(qpos)}")
+    return _render(character, qpos, _cameras(qpos, fps, distance, elevation), size, ghost, caption, markers)
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
@@ -88,11 +96,21 @@ def write_strip(
     columns: int = 8,
     rows: int = 1,
     size: tuple[int, int] = (200, 260),
+    markers: Sequence[Sequence[Marker]] | None = None,
+    distance: float = DISTANCE,
+    elevation: float = ELEVATION,
 ) -> None:
-    """Write a PNG of columns x rows stills, evenly spaced over poses qpos (T, nq), each `size` (width, height)."""
-    picked = qpos[np.linspace(0, len(qpos) - 1, columns * rows).round().astype(int)]
-    # one heading for all stills: the camera goes along but does not turn
-    tiles = np.stack(list(_render(character, picked, _cameras(picked, 1e-3), size, None, "")))
+    """Write a PNG of columns x rows stills, evenly spaced over poses qpos (T, nq), each `size` (width, height).
+
+    markers, distance, elevation: as in render_frames.
+    """
+    picked = np.linspace(0, len(qpos) - 1, columns * rows).round().astype(int)
+    shown = None if markers is None else [markers[t] for t in picked]
+    # one heading for all stills, which 1e-3 frames per second gives: the camera goes along but does not turn
+    frames = render_frames(
+        character, qpos[picked], fps=1e-3, size=size, markers=shown, distance=distance, elevation=elevation
+    )
+    tiles = np.stack(list(frames))
     grid = tiles.reshape(rows, columns, *tiles.shape[1:]).transpose(0, 2, 1, 3, 4)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.png")
@@ -115,7 +133,7 @@ def _pipe(command: list[str], first: np.ndarray, frames: Iterator[np.ndarray]) -
         raise RenderError(f"ffmpeg ended with code {encoder.returncode}: {message}")
 
 
-def _cameras(qpos: np.ndarray, fps: float) -> list[mujoco.MjvCamera]:
+def _cameras(qpos: np.ndarray, fps: float, distance: float, elevation: float) -> list[mujoco.MjvCamera]:
     """One camera per frame, looking at the smoothed root from three quarters in front of the mean heading."""
     sigma = FOLLOW_SECONDS * fps
     reach = np.arange(-round(3 * sigma), round(3 * sigma) + 1)
@@ -127,7 +145,7 @@ def _cameras(qpos: np.ndarray, fps: float) -> list[mujoco.MjvCamera]:
     for x, y, z in look_at:
         camera = mujoco.MjvCamera()
         camera.lookat[:] = x, y, 0.55 * z + 0.4
-        camera.distance, camera.elevation = DISTANCE, ELEVATION
+        camera.distance, camera.elevation = distance, elevation
         camera.azimuth = np.rad2deg(heading) + THREE_QUARTERS
         cameras.append(camera)
     return cameras
@@ -187,13 +205,15 @@ def _render(
     size: tuple[int, int],
     ghost: np.ndarray | None,
     caption: str,
+    markers: Sequence[Sequence[Marker]] | None,
 ) -> Iterator[np.ndarray]:
     model = _model(character, size)
     pale = _model(character, size)
     pale.geom_rgba[1:] = np.where(pale.geom_group[1:, None] == BONE_GROUP, 0, GHOST)
     data, option, pert = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
     moving = mujoco.mjtCatBit.mjCAT_DYNAMIC
-    scene = mujoco.MjvScene(model, maxgeom=10 * model.ngeom)
+    most = max((len(shown) for shown in markers or ()), default=0)
+    scene = mujoco.MjvScene(model, maxgeom=10 * model.ngeom + most)
     scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
     scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
     scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
@@ -210,6 +230,8 @@ def _render(
                 data.qpos[:] = ghost[t]
                 mujoco.mj_kinematics(pale, data)
                 mujoco.mjv_addGeoms(pale, data, option, pert, moving, scene)
+            for marker in markers[t] if markers else ():
+                _mark(marker, scene)
             mujoco.mjr_render(view, scene, context)
             if caption:
                 mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, corner, view, caption, "", context)
@@ -232,3 +254,22 @@ def _shade(model: mujoco.MjModel, data: mujoco.MjData, scene: mujoco.MjvScene) -
             disc, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, np.array([x, y, 0.002]), np.eye(3).ravel(), shade
         )
         scene.ngeom += 1
+
+
+def _mark(marker: Marker, scene: mujoco.MjvScene) -> None:
+    """Add a marker; it glows a little, so that its colour is the same from all sides."""
+    geom, r = scene.geoms[scene.ngeom], marker.radius
+    shape, size = {
+        "ball": (mujoco.mjtGeom.mjGEOM_SPHERE, (r, 0, 0)),
+        "disc": (mujoco.mjtGeom.mjGEOM_CYLINDER, (r, 0.006, 0)),
+        "pole": (mujoco.mjtGeom.mjGEOM_CAPSULE, (r, r, 0)),
+        "arrow": (mujoco.mjtGeom.mjGEOM_ARROW, (r, r, r)),
+    }[marker.shape]
+    rgba = np.array(marker.rgba, dtype=np.float32)
+    mujoco.mjv_initGeom(
+        geom, shape, np.array(size, dtype=float), np.array(marker.pos, dtype=float), np.eye(3).ravel(), rgba
+    )
+    if marker.end is not None:
+        mujoco.mjv_connector(geom, shape, r, np.array(marker.pos, dtype=float), np.array(marker.end, dtype=float))
+    geom.emission = 0.4
+    scene.ngeom += 1

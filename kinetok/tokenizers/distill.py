@@ -19,11 +19,12 @@ from torch import Tensor
 from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
+from kinetok.rl.training import refuse_changed
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.track import TrackingScore, track
-from kinetok.tokenizers.train import identify, in_scene, refuse_changed
+from kinetok.tokenizers.train import KINDS, identify, in_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +78,7 @@ def distill(
     labels = torch.empty(config.memory, env.action_size)
     if path.exists():
         tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, DistillStage)
+        refuse_changed(path, meta["identity"], identity, KINDS | {"stage": DistillStage})
         tree = unflatten(tensors, meta["tree"])
         student.load_state_dict(tree["student"])
         optimizer.load_state_dict(tree["optimizer"])

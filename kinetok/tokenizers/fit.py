@@ -26,13 +26,14 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import torch_threads
+from kinetok.rl.training import Progress, refuse_changed
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.distill import DistillStage, distill
 from kinetok.tokenizers.quantizer import ContinuousConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore
-from kinetok.tokenizers.train import PPOStage, identify, in_scene, refuse_changed, train_ppo
+from kinetok.tokenizers.train import KINDS, PPOStage, good_enough, identify, in_scene, train_ppo
 
 STAGES = ("teacher", "distill", "ppo")
 
@@ -176,12 +177,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
 
 def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
     """One expert per clip, `config.workers` at a time on one core each; finished ones are left alone."""
-    for clip in clips:
-        state = out / clip.name / "state.safetensors"
-        if state.exists():
-            identity = identify(config.teacher, _settings(config), [clip.name], seed)
-            refuse_changed(state, load_state(state)[1]["identity"], identity, PPOStage)
-    jobs = [(clip, config, out / clip.name, seed) for clip in clips if not (out / clip.name / "done").exists()]
+    jobs = [(clip, config, out / clip.name, seed) for clip in clips if not _taught(clip, config, out / clip.name, seed)]
     if len(jobs) <= 1 or config.workers <= 1:
         # Sums of a network depend on its threads: one for each of many teachers, as in the pool.
         with torch_threads(torch.get_num_threads() if len(clips) == 1 else 1):
@@ -204,6 +200,18 @@ def _report(running: dict, total: int) -> None:
         print(f"teacher {count}/{total} {running[future]}: {future.result()}", flush=True)
 
 
+def _taught(clip: Clip, config: FitConfig, out: Path, seed: int) -> bool:
+    """Whether the teacher in `out` is finished; refuses one that was trained otherwise."""
+    state = out / "state.safetensors"
+    if not state.exists():
+        return False
+    meta = load_state(state)[1]
+    identity = identify(config.teacher, _settings(config), [clip.name], seed)
+    refuse_changed(state, meta["identity"], identity, KINDS | {"stage": PPOStage})
+    progress = Progress(**meta["progress"])
+    return progress.samples >= config.teacher.samples or good_enough(progress, config.teacher)
+
+
 def _settings(config: FitConfig) -> TokenizerConfig:
     """The teachers' own, in the student's body and physics."""
     return replace(config.teacher_tokenizer, character=config.tokenizer.character, scene=config.tokenizer.scene)
@@ -224,7 +232,6 @@ def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int,
         card=lambda score: tokenizer_card(teacher, [clip.name], "teacher", seed, score),
         quiet=quiet,
     )
-    (out / "done").touch()
     return f"success {score.success.mean():.2f}, {score.mpjpe_mm.mean():.0f} mm"
 
 

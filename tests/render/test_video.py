@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from kinetok.render import RenderError, render_frames, write_strip, write_video
+from kinetok.sim.tasks import Marker
 
 SIZE = (160, 90)
 
@@ -55,6 +56,46 @@ def test_ghost_and_caption(egl, frames, humanoid, qpos):
     assert len(changed) and changed.max(0)[0] < 30 and changed.max(0)[1] < 80  # the upper left corner only
 
 
+RED, GREEN = (0.9, 0.1, 0.1, 1.0), (0.1, 0.8, 0.2, 1.0)
+
+
+def coloured(image: np.ndarray, channel: int) -> np.ndarray:
+    """Pixels (k, 2) as (row, column) whose channel stands well above the two others."""
+    values = image.astype(int)
+    return np.argwhere(values[..., channel] > 60 + np.delete(values, channel, axis=-1).max(-1))
+
+
+def test_a_marker_is_drawn_in_its_frame_only(egl, humanoid, qpos):
+    shown = [
+        Marker(shape="ball", pos=(0.3, 0.0, 0.2), radius=0.15, rgba=RED),
+        Marker(shape="disc", pos=(0.3, 0.0, 0.0), radius=0.4, rgba=RED),
+        Marker(shape="pole", pos=(0.3, 0.4, 0.0), end=(0.3, 0.4, 1.5), radius=0.05, rgba=RED),
+        Marker(shape="arrow", pos=(0.3, 0.2, 0.1), end=(0.9, 0.2, 0.1), radius=0.06, rgba=RED),
+    ]
+    markers = [[], *([marker] for marker in shown)]
+    plain, *marked = render_frames(humanoid, qpos[:5], fps=30, size=SIZE, markers=markers)
+    assert len(coloured(plain, 0)) == 0
+    assert all(20 < len(coloured(image, 0)) < 1500 for image in marked)
+
+
+def test_markers_are_where_they_are_said_to_be(egl, humanoid, qpos):
+    low, high = (0.0, 0.0, 0.1), (0.0, 0.0, 1.9)
+    markers = [[Marker(shape="ball", pos=p, radius=0.1, rgba=c) for p, c in ((low, RED), (high, GREEN))]]
+    near, far = (
+        next(render_frames(humanoid, qpos[:1], fps=30, size=SIZE, markers=markers, distance=d)) for d in (3.1, 6.0)
+    )
+    gaps = [coloured(image, 0).mean(0)[0] - coloured(image, 1).mean(0)[0] for image in (near, far)]
+    assert gaps[0] > 40 and 0.4 < gaps[1] / gaps[0] < 0.65  # red below green; 3.1 / 6.0 = .52 as large from afar
+    assert len(coloured(far, 0)) < len(coloured(near, 0))
+
+
+def test_a_strip_shows_the_markers_of_its_frames(egl, tmp_path, humanoid, qpos):
+    path, ball = tmp_path / "strip.png", Marker(shape="ball", pos=(0.3, 0.3, 0.3), radius=0.2, rgba=RED)
+    write_strip(path, humanoid, qpos, columns=2, size=(80, 60), markers=[[]] * 9 + [[ball]])
+    image = (matplotlib.image.imread(path)[..., :3] * 255).astype(int)
+    assert len(coloured(image[:, :80], 0)) == 0 and len(coloured(image[:, 80:], 0)) > 20
+
+
 def test_video_decodes_to_what_was_written(tmp_path, frames):
     path = tmp_path / "new" / "clip.mp4"
     write_video(path, frames, 25)
@@ -80,6 +121,12 @@ def test_messages(tmp_path, humanoid, qpos):
         render_frames(humanoid, qpos[:, :7], fps=30)
     with pytest.raises(ValueError, match=r"ghost has shape \(4, 43\); 'humanoid' needs \(10, 43\)"):
         render_frames(humanoid, qpos, fps=30, ghost=qpos[:4])
+    with pytest.raises(ValueError, match="markers are given for 3 frames, qpos for 10"):
+        render_frames(humanoid, qpos, fps=30, markers=[[]] * 3)
+    with pytest.raises(ValueError, match="marker 'ball' has no end"):
+        Marker(shape="ball", pos=(0, 0, 0), end=(0, 0, 1), radius=0.1, rgba=RED)
+    with pytest.raises(ValueError, match="marker 'arrow' needs an end"):
+        Marker(shape="arrow", pos=(0, 0, 0), radius=0.1, rgba=RED)
     with pytest.raises(ValueError, match="no frames; a video needs at least one"):
         write_video(tmp_path / "a.mp4", [], 30)
     with pytest.raises(ValueError, match=r"frames are 5 x 4; H.264 needs even sides"):

@@ -6,8 +6,10 @@ import torch
 
 from kinetok.checkpoint import CheckpointError, load_artifact
 from kinetok.config import ConfigError, override
+from kinetok.logger import read_metrics
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
+from kinetok.rl import training
 from kinetok.tokenizers import distill, train
 from kinetok.tokenizers.fit import fit, train_teachers
 
@@ -71,7 +73,7 @@ def test_a_finished_fit_returns_at_once(done, clips, small, monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("a finished run trains or evaluates")
 
-    monkeypatch.setattr(train, "collect", fail)
+    monkeypatch.setattr(training, "collect", fail)
     monkeypatch.setattr(train, "track", fail)
     monkeypatch.setattr(distill, "track", fail)
     assert fit(clips, small, out, seed=0).hash == tokenizer.hash
@@ -169,6 +171,13 @@ def test_a_folder_with_a_foreign_readme_is_left_alone(clips, small, tmp_path):
 
 def test_finished_teachers_are_not_passed_off_as_others(done, clips, small):
     out, _ = done
-    changed = replace(small, teacher=replace(small.teacher, samples=2048))
-    with pytest.raises(CheckpointError, match=r"stage\.samples: 1024 -> 2048"):
+    changed = replace(small, teacher=replace(small.teacher, rows=64))
+    with pytest.raises(CheckpointError, match=r"stage\.rows: 32 -> 64"):
         fit(clips, changed, out)
+
+
+def test_more_samples_take_a_finished_teacher_further(clips, small, tmp_path):
+    train_teachers(clips[:1], small, tmp_path, seed=0, threads=1)
+    further = replace(small, teacher=replace(small.teacher, samples=1536))
+    train_teachers(clips[:1], further, tmp_path, seed=0, threads=1)
+    assert [x["step"] for x in read_metrics(tmp_path / clips[0].name / "metrics.jsonl")][-1] == 1536

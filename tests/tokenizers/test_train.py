@@ -10,6 +10,7 @@ from kinetok.checkpoint import CheckpointError, load_artifact, load_state, save_
 from kinetok.config import ConfigError
 from kinetok.logger import read_metrics
 from kinetok.motion.library import ClipLibrary
+from kinetok.rl import training
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
@@ -48,7 +49,7 @@ def no_training(monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("a finished run trains or evaluates")
 
-    monkeypatch.setattr(train, "collect", fail)
+    monkeypatch.setattr(training, "collect", fail)
     monkeypatch.setattr(train, "track", fail)
 
 

@@ -1,0 +1,203 @@
+"""One PPO training from its first rollout to its best artifact; the same loop for every policy and task.
+
+    run = Training(out=out, world=env, policy=policy, critic=critic, config=PPOConfig(), modules={"actor": actor},
+                   identity=identity, seed=0)
+    progress = run.train(samples=1_000_000, eval_every=100_000, evaluate=evaluate, keep=keep)
+
+`out` receives metrics.jsonl and state.safetensors: a later call with the same identity goes on bit for bit where
+that state was written. The first rollout of a fresh policy only sets the normalisers. A loss that is not finite
+stops the run, keeps the last good state and dumps the offending rollout.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import nn
+
+from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
+from kinetok.config import diff, from_dict, to_dict
+from kinetok.logger import Logger
+from kinetok.rl.nets import Critic
+from kinetok.rl.policy import Policy
+from kinetok.rl.ppo import Optimizers, PPOConfig, update
+from kinetok.rl.returns import gae
+from kinetok.rl.rollout import Rollout, World, collect
+
+
+class Score(Protocol):
+    """What an evaluation found: merit orders artifacts, summary is logged, to_json survives a resumption."""
+
+    @property
+    def merit(self) -> float: ...
+    def summary(self) -> dict[str, float]: ...
+    def to_json(self) -> dict: ...
+
+
+@dataclass
+class Progress:
+    """What a run knows of itself besides its tensors. best, score: merit and to_json() of what was kept; stale:
+    evaluations since; evaluated: samples at the last evaluation."""
+
+    iteration: int = 0
+    samples: int = 0
+    evaluated: int = 0
+    best: float = -1e9
+    stale: int = 0
+    score: dict | None = None
+
+
+class Training:
+    """The mutable parts of one training, saved and restored together. modules: every network by its name in the
+    state; identity: what a run must share with another to go on from it (JSON); kinds: classes of the configs in it."""
+
+    def __init__(
+        self,
+        *,
+        out: Path,
+        world: World,
+        policy: Policy,
+        critic: Critic,
+        config: PPOConfig,
+        modules: Mapping[str, nn.Module],
+        identity: dict[str, Any],
+        kinds: Mapping[str, type],
+        seed: int,
+    ):
+        self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
+        self.modules, self.identity, self.kinds = {"critic": critic, **modules}, identity, kinds
+        self.optimizers = Optimizers(policy, critic, config)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    @property
+    def path(self) -> Path:
+        return self.out / "state.safetensors"
+
+    def train(
+        self,
+        *,
+        samples: int,
+        eval_every: int,
+        evaluate: Callable[[], Score],
+        keep: Callable[[Score], None],
+        finished: Callable[[Progress], bool] = lambda progress: False,
+        schedule: Callable[[float], None] = lambda share: None,
+        critic_warmup: int = 0,
+        warm: bool = False,
+        title: str = "ppo",
+        prefix: str = "eval",
+        quiet: bool = False,
+    ) -> Progress:
+        """Train until `samples` control steps are done or `finished` says so.
+
+        keep: writes the artifact, called with each score that is the best so far. schedule: told the share done
+        before each rollout. critic_warmup: first iterations that leave the policy alone. warm: the policy's
+        normalisers come from an earlier training, and the first rollout does not reset them.
+        """
+        progress = self.resume()
+        per_iteration = self.world.rows * self.config.horizon
+        start = progress.samples + per_iteration
+        with Logger(self.out, total=samples, title=title, start=start, quiet=quiet) as log:
+            obs = torch.from_numpy(self.world.reset(spread=True))
+            while progress.samples < samples and not finished(progress):
+                schedule(min(progress.samples / samples, 1.0))
+                rollout = collect(
+                    self.world, self.policy, self.critic, obs, horizon=self.config.horizon, generator=self.generator
+                )
+                obs = rollout.last_obs
+                first = progress.iteration == 0
+                metrics = {} if first else self.learn(rollout, train_actor=progress.iteration > critic_warmup)
+                if not (first and warm):
+                    self.policy.observe(rollout.obs)
+                self.critic.observe(rollout.obs)
+                progress.iteration += 1
+                progress.samples += per_iteration
+                due = progress.samples >= min(progress.evaluated + eval_every, samples)
+                if due:
+                    progress.evaluated = progress.samples
+                    score = evaluate()
+                    metrics |= {f"{prefix}/{name}": value for name, value in score.summary().items()}
+                    progress.stale += 1
+                    if score.merit > progress.best:
+                        progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
+                        keep(score)
+                log.write(progress.samples, metrics | self.world.episode_metrics())
+                if due:
+                    self.save(progress)
+                    obs = torch.from_numpy(self.world.reset(spread=True))
+        return progress
+
+    def learn(self, rollout: Rollout, *, train_actor: bool = True) -> dict[str, float]:
+        """One PPO update; FloatingPointError, with the rollout dumped, when anything is not finite."""
+        config = self.config
+        try:
+            advantages, targets = gae(
+                rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
+            )
+            metrics = update(
+                self.policy,
+                self.critic,
+                self.optimizers,
+                rollout,
+                advantages,
+                targets,
+                config,
+                generator=self.generator,
+                train_actor=train_actor,
+            )
+            # The last minibatch's gradient has no later loss that would show it.
+            finite = [torch.isfinite(p).all() for p in (*self.optimizers.parameters, *self.critic.parameters())]
+            if not (np.isfinite(list(metrics.values())).all() and torch.stack(finite).all()):
+                raise FloatingPointError(f"parameters or metrics are not finite: {metrics}")
+        except FloatingPointError as error:
+            dump = self.out / "bad_rollout.safetensors"
+            save_state(dump, {"obs": rollout.obs, "rewards": rollout.rewards, **rollout.taken}, {})
+            raise FloatingPointError(
+                f"{error}; training stopped. The rollout is in {dump}; the last good state in {self.path} is "
+                "untouched. Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
+            ) from error
+        return metrics | {"failed_simulations": self.world.failed_simulations}
+
+    def save(self, progress: Progress) -> None:
+        """Write the state, from which `resume` goes on."""
+        tree = {name: dict(module.state_dict()) for name, module in self.modules.items()}
+        tree |= {"optimizers": self.optimizers.state_dict(), "generator": self.generator.get_state()}
+        tensors, skeleton = flatten(tree)
+        meta = {"tree": skeleton, "identity": self.identity, "progress": vars(progress)}
+        save_state(self.path, tensors, meta | {"env": json.dumps(self.world.state_dict())})
+
+    def resume(self) -> Progress:
+        """Take up the state in `out`; a fresh Progress where there is none. CheckpointError if it is another run's."""
+        if not self.path.exists():
+            return Progress()
+        tensors, meta = load_state(self.path)
+        refuse_changed(self.path, meta["identity"], self.identity, self.kinds)
+        tree = unflatten(tensors, meta["tree"])
+        for name, module in self.modules.items():
+            module.load_state_dict(tree[name])
+        self.optimizers.load_state_dict(tree["optimizers"])
+        self.generator.set_state(tree["generator"])
+        self.world.load_state_dict(json.loads(meta["env"]))
+        return Progress(**meta["progress"])
+
+
+def refuse_changed(path: Path, old: dict, new: dict, kinds: Mapping[str, type]) -> None:
+    """Raise CheckpointError where the state at `path` is of another run, by its identity.
+
+    kinds: the config class behind keys of the identity: a setting that the old one does not know had its default.
+    A longer run is the same run: where both say `stage.samples`, the new one may be larger.
+    """
+    old = old | {key: to_dict(from_dict(kind, old[key])) for key, kind in kinds.items()}
+    before, now = old.get("stage", {}).get("samples", 0), new.get("stage", {}).get("samples", 0)
+    if now > before:
+        old["stage"] = old["stage"] | {"samples": now}
+    changed = diff(old, new)
+    if changed:
+        raise CheckpointError(
+            f"{path}: this run was started with another configuration: {'; '.join(changed)}. "
+            "Repeat the old settings to go on, or choose another --out"
+        )
