@@ -25,7 +25,7 @@ BELOW = {
 PURE = {
     "tokenizers": {"quantizer", "fsq", "vq", "rvq", "categorical", "gaussian", "spherical", "layout"},
     "gpt": {"model", "cache", "sample"},
-    "adapters": {"lora", "dora", "cola", "inject"},
+    "adapters": {"lora", "dora", "cola", "full", "inject"},
 }
 OUTSIDE = {"torch", "numpy", "einops"}
 BORDERS = {
@@ -44,6 +44,8 @@ EXTRAS = {
     "tensorboard",
     "torch.utils.tensorboard",
     "mink",
+    "daqp",
+    "mujoco_menagerie",
     "mujoco_warp",
     "wandb",
     "huggingface_hub",

@@ -1,34 +1,48 @@
 """A character: any MJCF read once, with the names, addresses, limits, gains and roles the rest of kinetok needs.
 
-    humanoid = Character.load("humanoid")          # built in
+    humanoid = Character.load("humanoid")          # built in, see characters()
     robot = Character.load("my_robot.xml")         # roles in my_robot.json beside it, optional
-    humanoid.body_names, humanoid.nu, humanoid.kp
+    talos = Character.load("menagerie:pal_talos")  # with the package mujoco-menagerie, which downloads it
+    humanoid.body_names, humanoid.nu, humanoid.kp, humanoid.parts["left_shin"], humanoid.mirror_qpos(qpos)
 
 The MJCF holds one tree with a free root and position actuators (PD control with kp in the actuator and kd as
 joint damping or actuator kv); floor, light and solver options belong to `sim.scene`. Refused: no free root, no
-actuators, an actuator without a position gain. It does not know clips, simulation or learning.
+actuators, an actuator without a position gain, a floor. It does not know clips, simulation or learning.
 """
 
 import functools
-import json
+import re
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from kinetok.config import ConfigError, nearest
-from kinetok.rotation import to_rotvec
+from kinetok.motion.mirror import mirror_map
+from kinetok.motion.roles import JOINTS, PARTS, PLANES, check_roles, counterparts, read_roles
+from kinetok.rotation import from_rotvec, to_rotvec
 
-BUILT_IN = ("humanoid",)
+try:
+    import mujoco_menagerie as menagerie
+except ImportError:
+    menagerie = None  # pyright: ignore[reportAssignmentType]
+
+BUILT_IN = ("humanoid", "g1")
+ASSETS = Path(__file__).parent / "assets"
+MENAGERIE = "menagerie:"
+
+
+def characters() -> list[str]:
+    """Names of the built-in characters."""
+    return list(BUILT_IN)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Character:
     """Immutable description of a body.
 
-    Fields: name; xml: the MJCF text; roles: {"feet": [...], "hands": [...], "head": ...} by body name;
+    Fields: name; xml: the MJCF text; roles: {"feet": [...], "hands": [...], "head": ...} by body name, see roles.py;
     model: the compiled MjModel of the character alone (no floor); body_names (B,) without the world;
     parents (B,) index into body_names, -1 for the root; kp, kd, torque (nu,) in N m / rad, N m s / rad, N m;
     ball (nj, 2): for each ball joint its first qpos and first actuator column; hinge (nj, 2) likewise; dof (nu,):
@@ -51,12 +65,11 @@ class Character:
     @staticmethod
     @functools.lru_cache(maxsize=16)
     def load(name: str) -> "Character":
-        """The built-in character of that name, or the one in the MJCF file at that path."""
+        """The built-in character of that name, the one in the MJCF file at that path, or one of the menagerie."""
         if name in BUILT_IN:
-            folder = resources.files("kinetok.motion") / "assets"
-            xml, roles = (folder / f"{name}.xml").read_text(), json.loads((folder / f"{name}.json").read_text())
-            return from_mjcf(name, xml, roles)
-        path = Path(name)
+            path = ASSETS / f"{name}.xml"
+            return from_mjcf(name, path.read_text(), read_roles(path.with_suffix(".json")), f"{name}.json")
+        path = _from_menagerie(name) if name.startswith(MENAGERIE) else Path(name)
         if path.suffix != ".xml":
             raise ConfigError(
                 f"unknown character {name!r}{nearest(name, BUILT_IN)}; built in: {', '.join(BUILT_IN)}; "
@@ -64,9 +77,8 @@ class Character:
             )
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such MJCF file")
-        roles_path = path.with_suffix(".json")
-        roles = json.loads(roles_path.read_text()) if roles_path.exists() else {}
-        return from_mjcf(path.stem, path.read_text(), roles)
+        roles = path.with_suffix(".json")
+        return from_mjcf(path.stem, read_mjcf(path), read_roles(roles) if roles.exists() else {}, str(roles))
 
     @property
     def nq(self) -> int:
@@ -87,6 +99,68 @@ class Character:
         names = self.roles[role]
         return [self.body_names.index(n) for n in ([names] if isinstance(names, str) else names)]
 
+    @functools.cached_property
+    def parts(self) -> dict[str, int]:
+        """Parts of a body (roles.PARTS: "pelvis", "left_thigh", ...) as indices into body_names, as far as the roles
+        name them. A part is the body that turns with that segment."""
+        named = self.roles.get("retarget", {})
+        return {part: self.body_names.index(named[part]) for part in PARTS if part in named}
+
+    def part(self, name: str) -> int:
+        """Index into body_names of one part, named as in `parts` or by the joint at its upper end ("left_knee")."""
+        side, _, joint = name.partition("_")
+        name = f"{side}_{JOINTS[joint]}" if joint in JOINTS else name
+        if name not in PARTS:
+            raise ConfigError(f"unknown part {name!r}; one of: {', '.join(PARTS)}{nearest(name, PARTS)}")
+        if name not in self.parts:
+            raise ConfigError(
+                f"character {self.name!r}: no body is named for {name!r}; named: {', '.join(self.parts) or 'none'}; "
+                f'add "retarget": {{"{name}": <body>}} to its roles file; bodies: {", ".join(self.body_names)}'
+            )
+        return self.parts[name]
+
+    def mirror_qpos(self, qpos: np.ndarray) -> np.ndarray:
+        """Poses (..., nq) reflected left to right through the world's xz plane; sides change places."""
+        matrix, offset = self._mirror
+        return (qpos @ matrix.T + offset).astype(qpos.dtype, copy=False)
+
+    @functools.cached_property
+    def _mirror(self) -> tuple[np.ndarray, np.ndarray]:
+        if "mirror" not in self.roles:
+            raise ConfigError(
+                f"character {self.name!r} names no 'mirror', which says which of its bodies are left and right; "
+                'add "mirror": {"swap": "left_ <-> right_", "plane": "xz"} to its roles file'
+            )
+        images = counterparts(self.roles, list(self.body_names), f"character {self.name!r}")
+        return mirror_map(self.model, images, PLANES[self.roles["mirror"]["plane"]], self.name)
+
+    def stand(self) -> np.ndarray:
+        """The standing pose (nq,): joint angles of the role "stand", those it leaves out at rest; the lowest geom that
+        collides touches the floor."""
+        qpos = self.model.qpos0.copy()
+        for name, angle in self.roles.get("stand", {}).items():
+            joint = self.model.joint(name)
+            ball = joint.type[0] == mujoco.mjtJoint.mjJNT_BALL
+            values = from_rotvec(np.array(angle, dtype=float)) if ball else np.ravel(angle)
+            qpos[joint.qposadr[0] : joint.qposadr[0] + len(values)] = values
+        qpos[2] -= self.span(qpos)[0]
+        return qpos
+
+    def span(self, qpos: np.ndarray) -> tuple[float, float]:
+        """Heights in metres of the lowest and the highest point of the geoms that collide, in pose qpos (nq,)."""
+        far, flip = 100.0, [0, 1, 0, 0]
+        spec, plane = mujoco.MjSpec.from_string(self.xml), mujoco.mjtGeom.mjGEOM_PLANE
+        for name, z, quat in (("span low", -far, [1, 0, 0, 0]), ("span high", far, flip)):
+            spec.worldbody.add_geom(name=name, type=plane, size=[0, 0, 1], pos=[0, 0, z], quat=quat, contype=0)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        low, high = model.geom("span low").id, model.geom("span high").id
+        geoms = set(np.flatnonzero(_meets_floor(model)).tolist()) - {low, high}
+        gap = [min(mujoco.mj_geomDistance(model, data, p, g, 2 * far, None) for g in geoms) for p in (low, high)]
+        return gap[0] - far, far - gap[1]
+
     def pose_to_ctrl(self, qpos: np.ndarray) -> np.ndarray:
         """PD targets (..., nu) whose rest is the pose qpos (..., nq): angles, and rotation vectors of ball joints."""
         ctrl = np.empty((*qpos.shape[:-1], self.nu), dtype=qpos.dtype)
@@ -99,21 +173,118 @@ class Character:
         return ctrl
 
 
-def from_mjcf(name: str, xml: str, roles: dict) -> Character:
-    """Read an MJCF text; errors name the character and what its MJCF lacks."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+def from_mjcf(name: str, xml: str, roles: dict, roles_file: str = "roles") -> Character:
+    """Read an MJCF text; errors name the character and what its MJCF lacks. roles_file: for messages."""
+    try:
+        model = mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        raise ConfigError(f"character {name!r}: MuJoCo cannot read its MJCF: {error}") from error
+    _check_tree(name, model)
+    kp = _position_gains(name, model)
+    ball, hinge, dof = _actuated(name, model)
+    check_roles(roles, model, roles_file)
+    return Character(
+        name=name,
+        xml=xml,
+        roles=roles,
+        model=model,
+        body_names=tuple(model.body(i).name for i in range(1, model.nbody)),
+        parents=tuple(int(p) - 1 for p in model.body_parentid[1:]),
+        kp=kp,
+        kd=model.dof_damping[dof] - model.actuator_biasprm[:, 2],
+        torque=np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf),
+        ball=ball,
+        hinge=hinge,
+        dof=dof,
+    )
+
+
+def read_mjcf(path: Path) -> str:
+    """The MJCF text at path, complete in itself: includes are expanded, mesh and texture folders made absolute."""
+    text = path.read_text(encoding="utf-8")
+    if not re.search(r"\bfile\w*\s*=", text):
+        return text
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path}: MuJoCo cannot read it: {error}") from error
+    folder = path.parent.resolve()
+    spec.meshdir, spec.texturedir = str(folder / spec.meshdir), str(folder / spec.texturedir)
+    return spec.to_xml()
+
+
+def _from_menagerie(name: str) -> Path:
+    """The MJCF of "menagerie:ROBOT" or "menagerie:ROBOT/VARIANT", downloaded unless it is in the package's cache."""
+    if menagerie is None:
+        raise ConfigError(f"{name}: the menagerie's models come with a package: pip install mujoco-menagerie")
+    robot, _, entry = name.removeprefix(MENAGERIE).partition("/")
+    try:
+        found = menagerie.get(robot)
+        return found.xml(entry or found.default_model)
+    except menagerie.DownloadError as error:
+        raise ConfigError(
+            f"{name}: the download failed: {error}; connect to the network, or set MENAGERIE_ROOT to a checkout of "
+            "mujoco_menagerie"
+        ) from error
+    except (menagerie.MenagerieError, OSError) as error:
+        raise ConfigError(f"{name}: {error}") from error
+
+
+def _meets_floor(model: mujoco.MjModel) -> np.ndarray:
+    """Which geoms collide with the floor of sim.scene, whose contype and conaffinity are 1."""
+    return (model.geom_contype & 1) | (model.geom_conaffinity & 1) == 1
+
+
+def _check_tree(name: str, model: mujoco.MjModel) -> None:
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE or model.jnt_bodyid[0] != 1:
         raise ConfigError(f"character {name!r}: the first joint must be a free joint (<freejoint/> in the root body)")
+    roots = [model.body(i).name for i in range(1, model.nbody) if model.body_parentid[i] == 0]
+    if len(roots) > 1:
+        raise ConfigError(f"character {name!r}: bodies {', '.join(map(repr, roots))} in the world; it must be one tree")
+    if model.body_geomnum[0]:
+        floor = model.geom(model.body_geomadr[0]).name
+        raise ConfigError(f"character {name!r}: its world has a geom ({floor!r}); leave out the floor, scenes have one")
+    if not _meets_floor(model).any():
+        raise ConfigError(f'character {name!r}: no geom collides with the floor; give its feet conaffinity="1"')
+
+
+def _position_gains(name: str, model: mujoco.MjModel) -> np.ndarray:
+    """kp (nu,) of the position actuators; any other kind of actuator is refused."""
     if model.nu == 0:
         raise ConfigError(f"character {name!r}: no actuators; add <position> actuators, they are the PD targets")
     kp = model.actuator_gainprm[:, 0].copy()
-    if (kp <= 0).any() or not np.allclose(model.actuator_biasprm[:, 1], -kp):
-        bad = model.actuator(int(np.argmax(~np.isclose(model.actuator_biasprm[:, 1], -kp)))).name
-        raise ConfigError(f"character {name!r}: actuator {bad!r} is not a <position> actuator; PD control needs one")
+    wrong = (kp <= 0) | ~np.isclose(model.actuator_biasprm[:, 1], -kp)
+    elsewhere = model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT
+    if elsewhere.any():
+        bad = model.actuator(int(np.argmax(elsewhere))).name
+        raise ConfigError(
+            f"character {name!r}: actuator {bad!r} does not drive a joint; leave it out, or give it joint="
+        )
+    if not wrong.any():
+        return kp
+    bad = int(np.argmax(wrong))
+    joint = model.joint(model.actuator_trnid[bad, 0])
+    stiffness, damping = model.jnt_stiffness[joint.id].flat[0], model.dof_damping[joint.dofadr[0]].flat[0]
+    hint = ""
+    if stiffness > 0:
+        hint = (
+            f"; the stiffness {stiffness:g} and damping {damping:g} of its joint are a spring here: if they are meant "
+            "as PD gains, move them into the actuator as kp and kv"
+        )
+    raise ConfigError(
+        f"character {name!r}: actuator {model.actuator(bad).name!r} is not a <position> actuator; PD control "
+        f'needs <position joint="{joint.name}" kp="..." kv="..." forcerange="..."/>{hint}'
+    )
+
+
+def _actuated(name: str, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ball (nj, 2), hinge (nj, 2) and dof (nu,) of a Character."""
     ball, hinge, dof = [], [], np.empty(model.nu, dtype=int)
     for u in range(model.nu):
         joint = model.actuator_trnid[u, 0]
         q, d = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            raise ConfigError(f"character {name!r}: actuator {model.actuator(u).name!r} drives the root, which is free")
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
             axis = u - ball[-1][1] if ball and ball[-1][0] == q else 0
             if axis > 2 or not np.array_equal(model.actuator_gear[u, :3], np.eye(3)[axis]):
@@ -125,20 +296,11 @@ def from_mjcf(name: str, xml: str, roles: dict) -> Character:
             if axis == 0:
                 ball.append((q, u))
         else:
+            if model.actuator_gear[u, 0] != 1:
+                raise ConfigError(
+                    f"character {name!r}: actuator {model.actuator(u).name!r} has gear {model.actuator_gear[u, 0]:g}; "
+                    "PD targets are joint angles, so put it into kp and leave the gear at 1"
+                )
             hinge.append((q, u))
             dof[u] = d
-    names = tuple(model.body(i).name for i in range(1, model.nbody))
-    return Character(
-        name=name,
-        xml=xml,
-        roles=roles,
-        model=model,
-        body_names=names,
-        parents=tuple(int(p) - 1 for p in model.body_parentid[1:]),
-        kp=kp,
-        kd=model.dof_damping[dof] - model.actuator_biasprm[:, 2],
-        torque=np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf),
-        ball=np.array(ball, dtype=int).reshape(-1, 2),
-        hinge=np.array(hinge, dtype=int).reshape(-1, 2),
-        dof=dof,
-    )
+    return np.array(ball, dtype=int).reshape(-1, 2), np.array(hinge, dtype=int).reshape(-1, 2), dof

@@ -1,13 +1,15 @@
 """character.py: the built-in humanoid against its source, PD targets against MuJoCo, messages."""
 
 import json
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from kinetok.config import ConfigError
-from kinetok.motion.character import Character, from_mjcf
+from kinetok.motion import character
+from kinetok.motion.character import Character, characters, from_mjcf, read_mjcf
 
 # joint id of the source file -> our body; its hands are bodies without a joint of their own
 BODIES = (
@@ -94,11 +96,104 @@ def mjcf(joint: str, actuator: str) -> str:
         ('<joint type="slide"/>', '<position joint="j" kp="1"/>', "the first joint must be a free joint"),
         ("<freejoint/>", "", "character 'c': no actuators; add <position> actuators"),
         ("<freejoint/>", '<motor name="m" joint="j"/>', "character 'c': actuator 'm' is not a <position> actuator"),
+        ("<freejoint/>", '<position name="p" joint="j" kp="1" gear="2"/>', "'p' has gear 2; PD targets are joint"),
+        ('<freejoint name="f"/>', '<position name="p" joint="f" kp="1"/>', "actuator 'p' drives the root"),
+        ("<freejoint/>", '<position name="p" body="b" kp="1"/>', "'c': MuJoCo cannot read its MJCF: XML Error"),
+        ("<freejoint/>", '<adhesion name="p" body="b" ctrlrange="0 1"/>', "'c': actuator 'p' does not drive a joint"),
     ],
 )
 def test_what_an_mjcf_lacks(joint, actuator, message):
     with pytest.raises(ConfigError, match=message):
         from_mjcf("c", mjcf(joint, actuator), {})
+
+
+GOOD = mjcf("<freejoint/>", '<position joint="j" kp="1"/>')
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<worldbody>", '<worldbody><geom name="ground" type="plane" size="1 1 1"/>', "has a geom .'ground'."),
+        ("</worldbody>", '<body name="ball"/></worldbody>', "bodies 'a', 'ball' in the world; it must be one tree"),
+        ("<worldbody>", '<worldbody><body name="c"/>', "the first joint must be a free joint"),
+        ('<geom size="0.1"/>', '<geom size="0.1" contype="0" conaffinity="0"/>', "no geom collides with the floor"),
+    ],
+)
+def test_what_a_world_may_not_hold(old, new, message):
+    assert from_mjcf("c", GOOD, {}).nu == 1 and old in GOOD
+    with pytest.raises(ConfigError, match=f"character 'c': .*{message}"):
+        from_mjcf("c", GOOD.replace(old, new), {})
+
+
+def test_torque_motors_with_gains_in_the_joint(data_dir):
+    """The message says what the springs mean; converting is what docs/characters.md says."""
+    path = data_dir / "g1" / "g1_primitives_boxfeet.xml"
+    if not path.exists():
+        pytest.skip("data/g1/g1_primitives_boxfeet.xml is absent")
+    with pytest.raises(ConfigError, match=r"'left_hip_pitch_joint' is not a <position> .*stiffness 100 and damping 10"):
+        Character.load(str(path))
+    text = (Path(__file__).parents[2] / "docs" / "characters.md").read_text()
+    snippet = text.split("```python\n# torque motors")[1].split("```")[0]
+    scope = {"robot": path}
+    exec("#" + snippet, scope)
+    converted = from_mjcf("converted", scope["spec"].to_xml(), {})
+    np.testing.assert_allclose(converted.kp[:6], [100, 100, 100, 200, 20, 20])
+    np.testing.assert_allclose(converted.kd[:6], [10, 10, 10, 20, 2, 2])
+    np.testing.assert_allclose(converted.torque[:6], [88, 88, 88, 139, 50, 50])
+    assert not converted.model.jnt_stiffness.any()
+
+
+def test_a_file_of_files_is_read_whole(tmp_path, monkeypatch):
+    """Includes and meshes are found from anywhere, later too."""
+    folder = tmp_path / "robot"
+    (folder / "meshes").mkdir(parents=True)
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (folder / "meshes" / "foot.obj").write_text(tetrahedron)
+    (folder / "drive.xml").write_text('<mujoco><actuator><position joint="j" kp="9"/></actuator></mujoco>')
+    asset = '<compiler meshdir="meshes"/><asset><mesh name="m" file="foot.obj"/></asset>'
+    text = GOOD.replace("<mujoco>", "<mujoco>" + asset)
+    text = text.replace('<actuator><position joint="j" kp="1"/></actuator>', '<include file="drive.xml"/>')
+    text = text.replace('<geom size="0.1"/>', '<geom type="mesh" mesh="m"/>')
+    (folder / "robot.xml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    robot = Character.load("robot/robot.xml")
+    monkeypatch.chdir(folder / "meshes")
+    assert mujoco.MjModel.from_xml_string(robot.xml).nmesh == 1
+    assert (robot.kp.tolist(), robot.span(robot.stand())[0]) == ([9.0], pytest.approx(0, abs=1e-6))
+    (folder / "drive.xml").unlink()
+    with pytest.raises(ConfigError, match=r"robot\.xml: MuJoCo cannot read it: .*drive\.xml"):
+        read_mjcf(folder / "robot.xml")
+
+
+def test_menagerie(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco_menagerie")
+    monkeypatch.setenv("MENAGERIE_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("MENAGERIE_BASE_URL", (tmp_path / "nothing").as_uri())
+    with pytest.raises(ConfigError, match=r"menagerie:unitree_g1: the download failed: .*; connect .* MENAGERIE_ROOT"):
+        Character.load("menagerie:unitree_g1")
+    with pytest.raises(ConfigError, match=r"Unknown robot 'unitree_g7'. Did you mean 'unitree_g1'"):
+        Character.load("menagerie:unitree_g7")
+    (tmp_path / "unitree_g1").mkdir()
+    (tmp_path / "unitree_g1" / "g1.xml").write_text(GOOD)
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    assert Character.load("menagerie:unitree_g1").name == "g1"
+    with pytest.raises(ConfigError, match="no entry point 'g2'; available: g1"):
+        Character.load("menagerie:unitree_g1/g2")
+    monkeypatch.setattr(character, "menagerie", None)
+    with pytest.raises(ConfigError, match=r"menagerie:unitree_h1: .*: pip install mujoco-menagerie"):
+        Character.load("menagerie:unitree_h1")
+
+
+def test_standing_pose_and_span(humanoid, tiny):
+    assert characters() == ["humanoid", "g1"]
+    qpos = humanoid.stand()
+    assert humanoid.span(qpos) == pytest.approx((0, 1.619), abs=1e-3)  # the head's sphere ends 1.6190 m up
+    qpos[2] += 1.5
+    assert humanoid.span(qpos) == pytest.approx((1.5, 3.119), abs=1e-3)
+    assert tiny.span(tiny.stand()) == pytest.approx((0, 0.3 + 0.5 + 1.0 + 0.1))  # box, arm, hand
+    qpos = tiny.stand()
+    qpos[7:11] = np.sqrt(0.5), np.sqrt(0.5), 0, 0  # the arm horizontal
+    assert tiny.span(qpos) == pytest.approx((0, 0.3 + 0.5 + 0.1))
 
 
 def test_load_from_a_path_with_roles_beside_it(tmp_path):
