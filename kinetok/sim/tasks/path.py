@@ -19,7 +19,7 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import AHEAD, GOAL, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +116,20 @@ class Path:
     def measure(self, body: BodyState) -> dict[str, np.ndarray]:
         """(N,) by name, for a `Scorecard`: the distance to where the root should be now."""
         return {"path_distance_m": length(body.pos[:, 0, :2] - self.target)}
+
+    def hindsight(
+        self, root: np.ndarray, heading: np.ndarray, ends: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
+        heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
+
+        The waypoints are where the root was when they would have been due.
+        """
+        now, parts = np.arange(len(root))[:, None], []
+        for number in range(1, self.config.waypoints + 1):
+            ahead = np.broadcast_to(now + number * self.arc, heading.shape)
+            parts.append(from_heading(later(root, ahead) - root, heading))
+        return np.concatenate(parts, axis=-1), now + self.config.waypoints * self.arc <= ends
 
     def markers(self, row: int) -> list[Marker]:
         """Balls along the path, larger where a waypoint is, and a disc where the root should be now."""

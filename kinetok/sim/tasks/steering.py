@@ -20,7 +20,7 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import GOAL, SIDE, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +113,22 @@ class Steering:
             "velocity_error_mps": length(body.linear[:, 0, :2] - asked),
             "heading_error_rad": np.abs(np.arctan2(np.sin(aside), np.cos(aside))),
         }
+
+    def hindsight(
+        self, root: np.ndarray, heading: np.ndarray, ends: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
+        heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
+
+        The command is the mean velocity over half a second to the shortest command, and the facing is the one that
+        the body had then.
+        """
+        hz, now = self.control_hz, np.arange(len(root))[:, None]
+        ahead = now + rng.integers(hz // 2, max(round(self.config.seconds[0] * hz), hz // 2 + 1), heading.shape)
+        velocity = (later(root, ahead) - root) * (hz / (ahead - now))[..., None]
+        facing = direction(later(heading, ahead))
+        c = np.concatenate([from_heading(velocity, heading), from_heading(facing, heading)], axis=-1)
+        return c, ahead <= ends
 
     def markers(self, row: int) -> list[Marker]:
         """On the floor an arrow to where the root should be in a second; above the head a small one to the facing."""

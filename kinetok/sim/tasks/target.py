@@ -17,7 +17,7 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import DONE, GOAL, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +102,22 @@ class Target:
         the last distance where a target has just given way to the next, else NaN."""
         distance = length(body.pos[:, 0, :2] - self.target)
         return {"target_distance_m": distance, "success_rate": self._success, "final_distance_m": self._final}
+
+    def hindsight(
+        self, root: np.ndarray, heading: np.ndarray, ends: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
+        heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
+
+        The target is where the root was after a random time of up to tau_reset, if it went there at half a metre a
+        second or more on the straight line, or stayed near.
+        """
+        steps, now = self.control_hz, np.arange(len(root))[:, None]
+        ahead = now + rng.integers(steps // 2, round(self.config.seconds[1] * steps), heading.shape)
+        offset = later(root, ahead) - root
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        brisk = distance > 0.5 * (ahead - now) / steps
+        return from_heading(offset, heading), (ahead <= ends) & (brisk | (distance < self.config.near))
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""

@@ -94,3 +94,15 @@ def check_ranges(**ranges: tuple[float, float]) -> None:
     for name, (low, high) in ranges.items():
         if not 0 < low <= high:
             raise ConfigError(f"{name} must be two positive numbers in order, not {(low, high)}")
+
+
+def later(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """values (T, N, ...) at step steps (T, N) instead, clipped to the last."""
+    steps = steps.clip(0, len(values) - 1)
+    return np.take_along_axis(values, steps.reshape(*steps.shape, *(1,) * (values.ndim - 2)), axis=0)
+
+
+def from_heading(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """World-frame vectors (T, N, 2) as headings angle (T, N), radians, see them: x ahead, y left."""
+    cos, sin, x, y = np.cos(angle), np.sin(angle), vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1).astype(np.float32)

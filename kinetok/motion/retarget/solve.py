@@ -1,0 +1,168 @@
+"""Inverse kinematics of a plan by mink: one small quadratic program per iteration, joint limits as constraints.
+
+    qpos = solve(figure, plan, fps=30)                        # (T, nq)
+
+Each frame starts from the plan itself where a part hangs on a single joint, whose angle the orientations of two parts
+give in closed form, and from the frame before elsewhere (several hinges in a row). A character whose every part
+hangs on one ball or hinge is then solved but for joint limits. Feet weigh most, then pelvis, hands and knees;
+orientations of the limbs settle what positions leave open. Needs the optional extra: pip install 'kinetok[retarget]'.
+"""
+
+import mujoco
+import numpy as np
+
+from kinetok import rotation
+from kinetok.motion.character import Character
+from kinetok.motion.clip import quaternion_columns
+from kinetok.motion.kinematics import lowest_point
+from kinetok.motion.retarget.body import ABOVE, Figure
+from kinetok.motion.retarget.targets import Plan, envelope
+
+# position per metre, orientation per radian
+COSTS = {
+    "pelvis": (5.0, 2.0),
+    "chest": (0.0, 1.0),
+    "head": (0.0, 0.5),
+    "thigh": (0.0, 0.2),
+    "shin": (1.0, 0.2),
+    "foot": (20.0, 2.0),
+    "upper_arm": (0.0, 0.2),
+    "lower_arm": (2.0, 0.2),
+    "hand": (2.0, 0.2),
+}
+POSTURE, DAMPING = 1e-3, 1e-4
+AFRESH, EACH, DONE = 20, 6, 1e-4  # most iterations from rest and from the frame before; rad, the step that ends them
+LOST = 0.04  # m: a pose farther than this from its targets is looked for from rest as well
+FASTEST = 25.0  # rad/s of a hinge: hinges in a row would flip where their axes align
+
+
+def solve(figure: Figure, plan: Plan, fps: float) -> np.ndarray:
+    """Poses (T, nq) of the character that follow the plan, at fps frames per second."""
+    try:
+        import daqp  # noqa: F401
+        import mink
+    except ImportError as error:
+        raise ImportError(
+            f"retargeting needs {error.name}, which is not installed: pip install 'kinetok[retarget]'"
+        ) from error
+    body, model = figure.character, figure.character.model
+    guess, known, turns = closed_form(figure, plan)
+    origins = {
+        part: place - rotation.rotate(turns[part], np.broadcast_to(figure.centre[part], place.shape))
+        for part, place in plan.places.items()
+    }
+    guess[:, :3] = origins["pelvis"]
+    tasks = {}
+    for part in turns:
+        place, turn = COSTS[part.removeprefix("left_").removeprefix("right_")]
+        tasks[part] = mink.FrameTask(
+            body.body_names[figure.bodies[part]], "body", place if part in origins else 0.0, turn
+        )
+    posture = mink.PostureTask(model, POSTURE)
+    posture.set_target(model.qpos0)
+    limits = [mink.ConfigurationLimit(model)]
+    configuration = mink.Configuration(model)
+    reach = np.full(model.nq, np.inf)
+    reach[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = FASTEST / fps
+    placed = [task for part, task in tasks.items() if part in origins and task.cost[0] > 0]
+
+    def descend(start: np.ndarray, iterations: int, near: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+        """The pose (nq,) that iterations from `start` reach, hinges within `reach` of `near`, and its worst place (m)."""
+        configuration.update(start)
+        for _ in range(iterations):
+            step = mink.solve_ik(configuration, [*tasks.values(), posture], 1.0, "daqp", DAMPING, limits=limits)
+            configuration.integrate_inplace(step, 1.0)
+            if near is not None:
+                configuration.update(np.clip(configuration.q, near - reach, near + reach))
+            if np.abs(step).max() < DONE:
+                break
+        return configuration.q.copy(), max(
+            float(np.linalg.norm(task.compute_error(configuration)[:3])) for task in placed
+        )
+
+    qpos = np.empty_like(guess)
+    for t in range(len(guess)):
+        for part, task in tasks.items():
+            where = origins[part][t] if part in origins else np.zeros(3)
+            task.set_target(mink.SE3(np.concatenate([turns[part][t], where])))
+        qpos[t], off = descend(np.where(known, guess[t], qpos[t - 1] if t else model.qpos0), EACH if t else AFRESH)
+        if t and off > LOST and not known.all():
+            other, better = descend(guess[t], AFRESH)
+            qpos[t] = other if better < off / 2 else qpos[t]
+        if t and (np.abs(qpos[t] - qpos[t - 1]) > reach).any():
+            qpos[t], _ = descend(np.clip(qpos[t], qpos[t - 1] - reach, qpos[t - 1] + reach), EACH, qpos[t - 1])
+    qpos = within_limits(model, qpos)
+    columns = quaternion_columns(body)[:, None] + np.arange(4)
+    qpos[:, columns] = rotation.align(rotation.normalize(qpos[:, columns]))
+    return qpos
+
+
+def clear_floor(body: Character, qpos: np.ndarray, fps: float) -> np.ndarray:
+    """Poses (T, nq) raised, smoothly in time, where a body that is no foot (hands, knees, back) would be below z = 0."""
+    qpos = qpos.copy()
+    qpos[:, 2] += envelope(np.maximum(-lowest_point(body, qpos), 0), fps)
+    return qpos
+
+
+def within_limits(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Poses (T, nq) with hinges clipped to their ranges and balls turned back to their largest angle."""
+    qpos = qpos.copy()
+    for joint in np.flatnonzero(model.jnt_limited):
+        at, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+            qpos[:, at : at + 4] = _shorten(qpos[:, at : at + 4], high)
+        else:
+            qpos[:, at] = np.clip(qpos[:, at], low, high)
+    return qpos
+
+
+def _shorten(turn: np.ndarray, largest: float) -> np.ndarray:
+    """Rotations (T, 4) about the same axes by no more than `largest` radians."""
+    vector = rotation.to_rotvec(turn)
+    angle = np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12)
+    return rotation.from_rotvec(vector * np.minimum(1, largest / angle))
+
+
+def closed_form(figure: Figure, plan: Plan) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Poses (T, nq) by the plan's orientations, which columns (nq,) they give (those of the root and of joints that
+    alone connect two parts), and the plan's orientations, part -> (T, 4), as far as the limits of those joints allow."""
+    model, data = figure.character.model, mujoco.MjData(figure.character.model)
+    mujoco.mj_kinematics(model, data)
+    turns = dict(plan.turns)
+    poses, known = np.tile(model.qpos0, (len(turns["pelvis"]), 1)), np.zeros(model.nq, dtype=bool)
+    poses[:, 3:7], known[:7] = turns["pelvis"], True
+    for part, above in ABOVE.items():
+        if part not in turns:
+            continue
+        joints = joints_between(model, figure.bodies[above] + 1, figure.bodies[part] + 1)
+        if len(joints) != 1:
+            continue
+        joint, end = joints[0], data.xquat[figure.bodies[part] + 1]
+        carrier = data.xquat[model.jnt_bodyid[joint]]
+        # R_part = R_above C Q D with the joint's rotation Q and constants C, D at rest
+        c = rotation.multiply(rotation.conjugate(data.xquat[figure.bodies[above] + 1]), carrier)
+        d = rotation.multiply(rotation.conjugate(carrier), end)
+        base = rotation.multiply(turns[above], c)
+        turn = rotation.multiply(rotation.conjugate(base), rotation.multiply(turns[part], rotation.conjugate(d)))
+        at, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
+        limited, axis = model.jnt_limited[joint], model.jnt_axis[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
+            turn = _shorten(turn, high) if limited else turn
+            poses[:, at : at + 4], known[at : at + 4] = turn, True
+        else:
+            angle = 2 * np.arctan2(turn[:, 1:] @ axis, turn[:, 0]) + model.qpos0[at]
+            angle = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+            poses[:, at], known[at] = np.clip(angle, low, high) if limited else angle, True
+            turn = rotation.from_rotvec((poses[:, at] - model.qpos0[at])[:, None] * axis)
+        turns[part] = rotation.multiply(rotation.multiply(base, turn), np.broadcast_to(d, turn.shape))
+    return poses, known, turns
+
+
+def joints_between(model: mujoco.MjModel, above: int, body: int) -> list[int]:
+    """Joints of a body and of those over it up to, not including, the body `above`."""
+    joints: list[int] = []
+    while body not in (above, 0):
+        first = model.body_jntadr[body]
+        joints += range(first, first + model.body_jntnum[body])
+        body = model.body_parentid[body]
+    return joints

@@ -1,0 +1,132 @@
+"""formats/__init__.py: every collected file reads, formats are told apart, and what is no motion is named or passed."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from kinetok.motion.clip import Clip
+from kinetok.motion.formats import FORMATS, FormatError, SkeletonMotion, read, read_clips, write_amass, write_robot_csv
+from kinetok.motion.library import ClipLibrary
+
+# frames per second and frames of one file of every format in the collection, and whose body it is
+COLLECTED = {
+    "amc/backflip.amc": (120.0, 247, "cmu-asf"),
+    "bvh/cmu_daz/cmu_02_01.bvh": (120.0, 344, "cmu-daz"),
+    "bvh/fair1/dab.bvh": (30.0, 339, "fair1"),
+    "g1/g1_moves/M_ShortMove15.csv": (30.0, 408, "g1"),
+    "g1/kimodo_wxyz/kimodo_walk.csv": (30.0, 150, "g1"),
+    "smpl/synthetic_run_09_01_poses.npz": (120.0, 143, "smpl"),
+    "smpl/synthetic_walk_12_01_stageii.npz": (120.0, 523, "smpl"),
+    "train/amp_npy/amp_humanoid_run.npy": (60.0, 82, "amp"),
+    "train/deepmimic/humanoid3d_run.txt": (30.0, 25, "humanoid"),
+}
+
+
+def facts(motion: Clip | SkeletonMotion) -> tuple[float, int, str]:
+    if isinstance(motion, Clip):
+        return round(motion.fps, 2), len(motion.qpos), motion.character
+    return round(motion.fps, 2), len(motion.root), motion.family
+
+
+def test_every_format_of_the_collection(data_dir):
+    for name, wanted in COLLECTED.items():
+        (motion,) = read(data_dir / name)
+        assert facts(motion) == wanted, name
+
+
+def test_every_collected_file(data_dir):
+    suffixes = {suffix for known in FORMATS for suffix in known.suffixes} - {".txt", ".json"}
+    files = [path for path in data_dir.rglob("*") if path.suffix in suffixes]
+    files += list(data_dir.glob("train/deepmimic*/*.txt"))
+    assert len(files) == 77
+    for path in files:
+        (motion,) = read(path)
+        assert facts(motion)[1] >= 2, path
+
+
+def test_a_folder_gives_what_is_motion_and_passes_the_rest(tmp_path, squat, data_dir):
+    write_robot_csv(tmp_path / "b.csv", squat.clip())
+    ClipLibrary.write(tmp_path / "a.safetensors", [squat.clip("one"), squat.clip("two")])
+    (poses,) = read(data_dir / "smpl" / "synthetic_run_09_01_poses.npz")
+    write_amass(tmp_path / "c_poses.npz", poses)
+    np.savez(tmp_path / "shape.npz", betas=np.zeros(16))
+    np.savez(tmp_path / "c_stagei.npz", poses=np.zeros((9, 156)), trans=np.zeros((9, 3)), mocap_framerate=9.0)
+    np.savez(tmp_path / "weights.npz", layer=np.zeros(3))
+    for name in ("LICENSE.txt", "notes.md", "notes.txt", "body.xml", "01.asf", "readme", "picture.png"):
+        (tmp_path / name).write_text("hello")
+    (tmp_path / "log.csv").write_text("step,loss\n1,2\n3,4\n")
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps({"weights": np.zeros(3)}))
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "folder.csv").mkdir()
+    names = [motion.name for motion in read(tmp_path)]
+    assert names == ["one", "two", "b", "c_poses"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "where", "reason"),
+    [
+        ("shape.npz", b"x", "file", "is no motion: it is the body shape of an AMASS subject"),
+        ("male_stagei.npz", b"x", "file", "the motion is in the *_stageii.npz"),
+        ("01.asf", b"x", "file", "the skeleton that .amc files refer to"),
+        ("body.xml", b"x", "file", "a character, not a motion"),
+        ("LICENSE.txt", b"x", "file", "a licence text"),
+        ("README.md", b"x", "file", "a text"),
+        (
+            "walk.fbx",
+            b"x",
+            "first bytes",
+            "unknown format; formats: DeepMimic .txt/.json, kinetok .safetensors, BVH .bvh",
+        ),
+        ("walk.pkl", pickle.dumps({"a": 1}), "first bytes", "unknown format"),
+        ("walk.bvh", b"", "file", "is empty"),
+        ("walk.csv", b"", "file", "is empty"),
+        ("walk.csv", b"a,b\n1,2\n3,4\n", "line 1", "the header lacks root_translateX"),
+        ("walk.npy", b"\x93NUMPY", "header", "not an npy array"),
+        ("walk.npz", b"PK\x03\x04", "archive", "damaged or cut off"),
+        ("walk.motion", b"PK\x03\x04", "archive", "damaged or cut off"),
+    ],
+)
+def test_a_named_file_says_why_not(tmp_path, name, content, where, reason):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FormatError) as caught:
+        read(tmp_path / name)
+    assert caught.value.where == where and reason in str(caught.value) and caught.value.path == tmp_path / name
+
+
+def test_broken_files_of_a_folder_are_not_passed_over(tmp_path, squat):
+    write_robot_csv(tmp_path / "a.csv", squat.clip())
+    (tmp_path / "b.bvh").write_text("")
+    with pytest.raises(FormatError, match=r"b\.bvh"):
+        read(tmp_path)
+
+
+def test_the_rate_of_files_that_name_none(tmp_path, squat):
+    write_robot_csv(tmp_path / "a.csv", squat.clip())
+    ClipLibrary.write(tmp_path / "b.safetensors", [squat.clip()])
+    assert [motion.fps for motion in read(tmp_path, fps=60)] == [60, 30]
+    assert [clip.fps for clip in read_clips(tmp_path)] == [30, 30]
+
+
+def test_robot_clips_stay_with_the_robot(tmp_path, squat):
+    write_robot_csv(tmp_path / "a.csv", squat.clip())
+    assert read_clips(tmp_path / "a.csv")[0].character == read_clips(tmp_path, "g1")[0].character == "g1"
+    with pytest.raises(
+        FormatError, match=r"a\.csv: a: is a motion of 'g1'; only recorded skeletons are retargeted to 'hum"
+    ):
+        read_clips(tmp_path, "humanoid")
+
+
+def test_skeletons_are_retargeted(data_dir):
+    pytest.importorskip("mink")
+    path = data_dir / "train" / "amp_npy" / "amp_humanoid_backflip.npy"
+    for character in (None, "g1"):
+        (clip,) = read_clips(path, character)
+        assert clip.character == (character or "humanoid") and clip.name == "amp_humanoid_backflip"
+        assert clip.seconds == pytest.approx(28 / 16, abs=0.04)
+
+
+def test_a_skeleton_that_is_no_body(data_dir):
+    path = data_dir / "bvh" / "edge" / "rotation_first_root.bvh"
+    with pytest.raises(FormatError, match=r"rotation_first_root\.bvh: skeleton: .*cannot tell which joints are"):
+        read_clips(path)
