@@ -10,6 +10,8 @@ An artifact is a directory of three files:
                   parents={"tokenizer": tokenizer.hash})
     artifact = load_artifact(out, "gpt")
 
+An adapter has peft's file names instead, adapter_config.json and adapter_model.safetensors: files=ADAPTER.
+
 A state is one file that holds any nest of dicts, lists, tuples, tensors and scalars:
 
     tensors, skeleton = flatten(optimizer.state_dict())
@@ -36,7 +38,7 @@ from safetensors.torch import save_file
 from kinetok import __version__
 from kinetok.config import nearest
 
-CONFIG, MODEL, CARD = "config.json", "model.safetensors", "README.md"
+CARD = "README.md"
 PACKAGED = Path(__file__).parent / "assets"
 Tensors = dict[str, torch.Tensor]
 
@@ -46,6 +48,18 @@ STAMP = {"kinetok": "artifact"}
 
 class CheckpointError(RuntimeError):
     """A file or directory that cannot be saved to or loaded from; the message names it and the remedy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """config, model: file names in an artifact directory, beside its README.md."""
+
+    config: str
+    model: str
+
+
+MODEL = Files(config="config.json", model="model.safetensors")
+ADAPTER = Files(config="adapter_config.json", model="adapter_model.safetensors")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,39 +86,47 @@ def save_artifact(
     tensors: Tensors,
     card: str,
     parents: dict[str, str] | None = None,
+    files: Files = MODEL,
+    extra: dict[str, Any] | None = None,
 ) -> Path:
     """Write an artifact directory, replacing the artifact there if there is one; returns its path.
 
-    parents: role -> hash of each artifact this one depends on, checked later by `require_parent`.
+    parents: role -> hash of each artifact this one depends on, checked later by `require_parent`. files: its names.
+    extra: further top-level keys of the config file, for other programs; `load_artifact` does not read them.
     """
     path = Path(path)
-    refuse_foreign(path)
+    refuse_foreign(path, files)
     header = {"kinetok": __version__, "kind": kind, "hash": "", "parents": parents or {}, "config": config}
+    taken = header.keys() & (extra or {}).keys()
+    if taken:
+        raise ValueError(f"extra may not hold {', '.join(sorted(taken))}: kinetok writes these keys itself")
+    header |= extra or {}
     _check_json(header, "config")
     path.mkdir(parents=True, exist_ok=True)
-    header["hash"] = _write(path / MODEL, lambda file: save_file(_owned(tensors), file, STAMP))
+    header["hash"] = _write(path / files.model, lambda file: save_file(_owned(tensors), file, STAMP))
     _write(path / CARD, lambda file: file.write_text(card, encoding="utf-8"))
     text = json.dumps(header, indent=2) + "\n"
-    _write(path / CONFIG, lambda file: file.write_text(text, encoding="utf-8"))
+    _write(path / files.config, lambda file: file.write_text(text, encoding="utf-8"))
     return path
 
 
-def load_artifact(path: Path | str, kind: str | None = None) -> Artifact:
-    """Read and verify an artifact. kind: what it must be; None accepts any.
+def load_artifact(path: Path | str, kind: str | None = None, files: Files = MODEL) -> Artifact:
+    """Read and verify an artifact. kind: what it must be; None accepts any. files: its names.
 
     path: its directory, or the name of one that comes with kinetok (`packaged()` lists them).
     """
-    path = locate(path)
-    header = _read_header(path)
+    path = locate(path, files)
+    header = _read_header(path, files)
     if kind is not None and header["kind"] != kind:
         raise CheckpointError(f"{path} is a {header['kind']!r}; a {kind!r} was asked for")
-    if not (path / MODEL).is_file():
-        raise CheckpointError(f"{path} has no {MODEL}; copy the whole directory again")
-    found = _sha256(path / MODEL)
+    model = path / files.model
+    if not model.is_file():
+        raise CheckpointError(f"{path} has no {files.model}; copy the whole directory again")
+    found = _sha256(model)
     if found != header["hash"]:
-        said = f"its hash is {found[:12]}, {CONFIG} says {header['hash'][:12]}"
-        raise CheckpointError(f"{path / MODEL} is truncated or edited: {said}; copy or save it again")
-    tensors, _ = _read_tensors(path / MODEL)
+        said = f"its hash is {found[:12]}, {files.config} says {header['hash'][:12]}"
+        raise CheckpointError(f"{model} is truncated or edited: {said}; copy or save it again")
+    tensors, _ = _read_tensors(model)
     return Artifact(
         path=path,
         kind=header["kind"],
@@ -115,17 +137,17 @@ def load_artifact(path: Path | str, kind: str | None = None) -> Artifact:
     )
 
 
-def packaged() -> list[str]:
-    """Names of the artifacts that come with kinetok."""
-    return sorted(entry.parent.name for entry in PACKAGED.glob(f"*/{CONFIG}"))
+def packaged(files: Files = MODEL) -> list[str]:
+    """Names of the artifacts with these file names that come with kinetok."""
+    return sorted(entry.parent.name for entry in PACKAGED.glob(f"*/{files.config}"))
 
 
-def locate(path: Path | str) -> Path:
+def locate(path: Path | str, files: Files = MODEL) -> Path:
     """The directory itself where it exists, else the packaged artifact of that name."""
     path = Path(path)
     if path.is_dir() or path.parent != Path():
         return path
-    if path.name in packaged():
+    if path.name in packaged(files):
         return PACKAGED / path.name
     return path
 
@@ -265,52 +287,54 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def refuse_foreign(path: Path) -> None:
-    """Refuse to write over a file, or over a config.json, model.safetensors or README.md that is not ours."""
+def refuse_foreign(path: Path, files: Files = MODEL) -> None:
+    """Refuse to write over a file, or over a config, model or README.md of these names that is not ours."""
     if path.exists() and not path.is_dir():
         raise CheckpointError(f"{path} is a file; an artifact is a directory, choose another path")
-    present = [name for name in (CONFIG, MODEL, CARD) if (path / name).exists()]
-    if present and not _is_ours(path):
+    present = [name for name in (files.config, files.model, CARD) if (path / name).exists()]
+    if present and not _is_ours(path, files):
         raise CheckpointError(
             f"{path} holds a {present[0]} that kinetok did not write; choose an empty or new directory"
         )
 
 
-def _is_ours(path: Path) -> bool:
-    # A first save cut short has left the tensors, which are stamped, and no config.json.
+def _is_ours(path: Path, files: Files) -> bool:
+    # A first save cut short has left the tensors, which are stamped, and no config.
     try:
-        if (path / CONFIG).exists():
-            header = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+        if (path / files.config).exists():
+            header = json.loads((path / files.config).read_text(encoding="utf-8"))
             return isinstance(header, dict) and "kinetok" in header
-        with safe_open(path / MODEL, "pt") as file:
+        with safe_open(path / files.model, "pt") as file:
             return "kinetok" in (file.metadata() or {})
     except (OSError, ValueError, SafetensorError):
         return False
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path, files: Files) -> dict[str, Any]:
     if not path.is_dir():
         siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
-        names = packaged() if path.parent == Path() else []
+        names = packaged(files) if path.parent == Path() else []
         known = f"; packaged: {', '.join(names)}" if names else ""
         raise CheckpointError(f"there is no directory {path}{nearest(path.name, siblings + names)}{known}")
-    if not (path / CONFIG).is_file():
-        raise CheckpointError(f"{path} has no {CONFIG}; it is not an artifact, or its first save was cut short")
+    config = path / files.config
+    if not config.is_file():
+        raise CheckpointError(f"{path} has no {files.config}; it is not an artifact, or its first save was cut short")
     try:
-        header = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+        header = json.loads(config.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise CheckpointError(f"{path / CONFIG} is not valid JSON ({error}); copy or save it again") from error
-    _check_header(path, header)
+        raise CheckpointError(f"{config} is not valid JSON ({error}); copy or save it again") from error
+    _check_header(config, header)
     return header
 
 
 def _check_header(path: Path, header: Any) -> None:
+    """Refuse the content `header` of the config file at `path` unless `save_artifact` wrote it."""
     wanted = {"kinetok": str, "kind": str, "hash": str, "parents": dict, "config": dict}
     if not isinstance(header, dict) or "kinetok" not in header:
-        raise CheckpointError(f"{path / CONFIG} was not written by kinetok: it has no key 'kinetok'")
+        raise CheckpointError(f"{path} was not written by kinetok: it has no key 'kinetok'")
     for key, kind in wanted.items():
         if not isinstance(header.get(key), kind):
-            raise CheckpointError(f"{path / CONFIG}: {key!r} is missing or not a {kind.__name__}; save it again")
+            raise CheckpointError(f"{path}: {key!r} is missing or not a {kind.__name__}; save it again")
     _refuse_newer(path, header["kinetok"])
 
 

@@ -146,6 +146,41 @@ def clips_import(paths: tuple[Path, ...], out: Path) -> None:
 
 
 @main.group(cls=Chain)
+def characters() -> None:
+    """Look at characters: the built-in ones, or any MJCF with a roles file (docs/characters.md)."""
+
+
+@characters.command("list")
+def characters_list() -> None:
+    """Names and sizes of the built-in characters."""
+    from kinetok.motion.character import Character
+    from kinetok.motion.character import characters as built_in
+
+    click.echo(f"{'name':<12}{'bodies':>7}{'driven':>8}{'mass kg':>9}{'height m':>10}")
+    for name in built_in():
+        body = Character.load(name)
+        height, mass = body.span(body.stand())[1], body.model.body_mass.sum()
+        click.echo(f"{name:<12}{len(body.body_names):>7}{body.nu:>8}{mass:>9.2f}{height:>10.2f}")
+
+
+@characters.command("show")
+@click.argument("name")
+@click.option("--out", default=None, type=PATHS, help="Also write a picture of it standing, ending in .png.")
+def characters_show(name: str, out: Path | None) -> None:
+    """Facts of a character: NAME is built in, the path of an MJCF, or menagerie:ROBOT."""
+    from kinetok.motion.character import Character
+    from kinetok.render.portrait import describe, write_portrait
+
+    if out is not None:
+        check_suffix(out, ".png")
+    body = Character.load(name)
+    click.echo(describe(body))
+    if out is not None:
+        write_portrait(out, body)
+        click.echo(f"wrote {out}")
+
+
+@main.group(cls=Chain)
 def tokenize() -> None:
     """Learn motion tokens through physics, and use them."""
 
@@ -253,24 +288,72 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
     )
 
 
+TASK_NAMES = click.Choice(["target", "steering", "path"])
+
+
 @main.command()
 @click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
+@click.option("--task", default="target", show_default=True, type=TASK_NAMES, help="What to do.")
+@click.option("--adapter", default="cola", show_default=True, type=click.Choice(["cola", "lora", "dora", "full"]))
+@click.option("--method", default="rl", show_default=True, help="rl, sft, or both: sft,rl.")
+@click.option("--clips", "paths", multiple=True, type=PATHS, help="Example motions for sft: file, library or folder.")
+@click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
+@configured("laptop")
+def finetune(prior, task, adapter, method, paths, out, preset, settings, threads, seed) -> None:
+    """Bend the frozen prior to a task with a small adapter: by reward (rl), by examples (sft), or one after the other.
+
+    \b
+    Presets: laptop (an hour or two on two cores), paper (GPC's sizes), tiny (tests).
+    kinetok finetune --task target --out runs/target
+    kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
+    kinetok sample --adapter runs/target --out target.mp4
+    """
+    from dataclasses import replace
+
+    from kinetok import presets
+    from kinetok.adapters import ADAPTERS
+    from kinetok.adapters.finetune import finetune as bend
+    from kinetok.config import override, pick
+    from kinetok.gpt.controller import Prior
+    from kinetok.sim.tasks import TASKS
+
+    config = pick(presets.FINETUNE, preset, "preset")()
+    if config.task.kind != task:
+        config = replace(config, task=TASKS[task][0]())
+    if config.adapter.kind != adapter:
+        kind = ADAPTERS[adapter][0]
+        shape = {name: getattr(config.adapter, name) for name in ("rank", "alpha") if hasattr(kind, name)}
+        config = replace(config, adapter=kind(**shape))
+    config = override(replace(config, methods=tuple(method.split(","))), settings)
+    bend(Prior.from_pretrained(prior), config, out, base=prior, clips=load_clips(paths), seed=seed, threads=threads)
+
+
+@main.command()
+@click.option("--prior", default=None, type=PATHS, help="Directory or packaged name.  [default: humanoid-gpt]")
+@click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill to play instead of the prior alone.")
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
 @click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
 @click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
 @click.option("--temperature", default=1.0, show_default=True, help="Above 1 is bolder, below 1 more usual.")
 @click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
-@click.option("--push", default=0.0, help="Push the character at 6.7 s, in m/s.")
+@click.option("--push", default=0.0, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds.")
 @option_seed
-def sample(prior, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
-    """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics)."""
+def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
+    """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics).
+
+    With --adapter the character does its task, and the video shows what is asked of it; the nucleus and the
+    temperature are then those it was trained with.
+    """
+    if adapter is not None:
+        return sample_skill(adapter, prior, out, seconds=seconds, count=count, push=push, seed=seed)
     from kinetok.evaluate import measure
     from kinetok.gpt.controller import Prior, roll
     from kinetok.motion.clip import Clip
     from kinetok.motion.library import ClipLibrary
 
     check_suffix(out, ".mp4")
+    prior = prior or "humanoid-gpt"
     model = Prior.from_pretrained(prior, tokenizer)
     character = model.tokenizer.config.character
     recording = roll(model, rows=count, seconds=seconds, top_p=top_p, temperature=temperature, push=push, seed=seed)
@@ -281,6 +364,35 @@ def sample(prior, tokenizer, out, seconds, top_p, temperature, count, push, seed
     ]
     ClipLibrary.write(out.with_suffix(".safetensors"), motion)
     show_json(measure(recording) | {"seed": seed, "top_p": top_p, "prior": str(prior)}, out.with_suffix(".json"))
+
+
+def sample_skill(adapter, prior, out: Path, *, seconds: float, count: int, push: float, seed: int) -> None:
+    """`sample --adapter`: the first character's video with markers, every character's clip, and the scores."""
+    from kinetok.adapters.finetune import Skill
+    from kinetok.adapters.rlft import play
+    from kinetok.motion.clip import Clip
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.render.video import render_frames, write_video
+
+    check_suffix(out, ".mp4")
+    skill = Skill.from_pretrained(adapter, prior)
+    played = play(
+        skill.controller(seed), skill.task, skill.prior,
+        episodes=count, seconds=seconds, push=push, seed=seed, record=count,
+    )  # fmt: skip
+    body, name = skill.prior.character, skill.task.kind
+    frames = render_frames(
+        body, played.qpos[:, 0], fps=played.fps, markers=played.markers, caption=name, distance=4.5, elevation=-28
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_video(out, frames, played.fps)
+    click.echo(f"wrote {out}: {len(played.qpos)} frames at {played.fps:g} fps")
+    motion = [
+        Clip(name=f"{name}{i}", character=body.name, fps=played.fps, qpos=played.qpos[:, i], source=str(adapter))
+        for i in range(count)
+    ]
+    ClipLibrary.write(out.with_suffix(".safetensors"), motion)
+    show_json(played.score.measures | {"seed": seed, "adapter": str(adapter)}, out.with_suffix(".json"))
 
 
 @main.group(cls=Chain)
@@ -322,6 +434,25 @@ def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, thread
 
     model = Prior.from_pretrained(prior, tokenizer)
     show_json(score(model, episodes=episodes, seconds=seconds, push=push, top_p=top_p, threads=threads, seed=seed), out)
+
+
+@evaluate.command("task")
+@click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill; without it, the prior alone.")
+@click.option("--prior", default=None, type=PATHS, help="Its prior, if not at the place it notes.")
+@click.option("--task", default=None, type=TASK_NAMES, help="Another task than the one it was bent to.")
+@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
+@click.option("--episodes", default=256, show_default=True, help="Characters, each for --seconds.")
+@click.option("--seconds", default=20.0, show_default=True, help="Length of each; a target comes every 6 to 8 s.")
+@click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@option_threads
+@option_seed
+def evaluate_task(adapter, prior, task, out, episodes, seconds, push, threads, seed) -> None:
+    """How well a skill does its task: success, final distance, errors, return and survival, as the task defines."""
+    from kinetok.evaluate import evaluate_task as score
+
+    show_json(
+        score(adapter, prior, task, episodes=episodes, seconds=seconds, push=push, threads=threads, seed=seed), out
+    )
 
 
 @main.command()

@@ -13,6 +13,7 @@ simulation has not blown up. A character that crawls or lies by intent does not 
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,11 +22,14 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from kinetok import metrics
-from kinetok.gpt.controller import Prior, Recording, roll
+from kinetok.adapters.finetune import Skill
+from kinetok.adapters.rlft import play
+from kinetok.gpt.controller import Prior, PriorController, Recording, roll
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.library import ClipLibrary
+from kinetok.sim.tasks import TASKS
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.track import track
@@ -153,6 +157,39 @@ def evaluate_prior(
         "temperature": temperature,
         "seed": seed,
     }
+
+
+def evaluate_task(
+    adapter: Path | str | None,
+    prior: Path | str | None = None,
+    task: str | None = None,
+    *,
+    episodes: int = 256,
+    seconds: float = 20.0,
+    push: float = 0.0,
+    seed: int = 0,
+    threads: int = 0,
+) -> dict[str, Any]:
+    """Scores of a skill, or of a prior alone where adapter is None, on a task (sim.tasks; the skill's own if None).
+
+    A Scorecard's measures: rewards, survival, and what the task defines, such as success_rate and final_distance_m.
+    """
+    if adapter is not None:
+        skill = Skill.from_pretrained(adapter, prior)
+        config = skill.task if task in (None, skill.task.kind) else TASKS[task][0]()
+        if config.kind != skill.task.kind:
+            raise ValueError(f"{adapter} was bent to {skill.task.kind!r} and cannot read what {task!r} asks")
+        controller, model = skill.controller(seed), skill.prior
+    else:
+        model, config = Prior.from_pretrained(prior or "humanoid-gpt"), TASKS[task or "target"][0]()
+        generator = torch.Generator().manual_seed(seed)
+        alone = PriorController(model, generator=generator)
+
+        def controller(obs: Tensor) -> Tensor:
+            return alone.act(obs[:, : model.gpt.config.state_dim])[0]
+
+    played = play(controller, config, model, episodes=episodes, seconds=seconds, push=push, seed=seed, threads=threads)
+    return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed}
 
 
 def measure(recording: Recording) -> dict[str, Any]:

@@ -5,6 +5,9 @@
 Any leaf is then changed by `--set key=value`.
 """
 
+from kinetok.adapters.cola import CoLAConfig
+from kinetok.adapters.finetune import FinetuneConfig
+from kinetok.adapters.sft import SFTConfig
 from kinetok.gpt.pretrain import PretrainConfig
 from kinetok.rl.ppo import PPOConfig
 from kinetok.sim.env import EnvConfig
@@ -103,3 +106,32 @@ def tiny_prior() -> PretrainConfig:
 
 
 PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
+
+
+def laptop_skill() -> FinetuneConfig:
+    """A task in an hour or two on two cores."""
+    return FinetuneConfig()
+
+
+def paper_skill() -> FinetuneConfig:
+    """GPC's published adapter (table 12), for a GPU."""
+    return FinetuneConfig(adapter=CoLAConfig(rank=64, alpha=128.0), samples=100_000_000, rows=4096)
+
+
+def tiny_skill() -> FinetuneConfig:
+    """Seconds, for tests."""
+    return FinetuneConfig(
+        adapter=CoLAConfig(rank=2, alpha=4.0, hidden=8),
+        sft=SFTConfig(samples=320, rows=16, iterations=10, batch=32, eval_every=5),
+        samples=512,
+        rows=32,
+        eval_every=256,
+        eval_episodes=4,
+        eval_seconds=1.0,
+        critic=(16,),
+        critic_warmup=0,
+        ppo=PPOConfig(horizon=8, minibatch=64, epochs=1),
+    )
+
+
+FINETUNE = {"laptop": laptop_skill, "paper": paper_skill, "tiny": tiny_skill}

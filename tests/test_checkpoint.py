@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from kinetok.checkpoint import (
+    ADAPTER,
     CheckpointError,
     flatten,
     load_artifact,
@@ -62,6 +63,28 @@ def test_saving_again_replaces_the_artifact_and_keeps_other_files(tmp_path):
     assert second.hash != first.hash and second.tensors["w"][0, 0] == 2
     assert (tmp_path / "metrics.jsonl").read_text() == "kept"
     assert (tmp_path / "README.md").read_text() == "new"
+
+
+def test_an_adapter_has_other_file_names_and_keys_for_other_programs(tmp_path):
+    path = save(tmp_path, files=ADAPTER, extra={"peft_type": "LORA", "r": 8})
+    assert sorted(file.name for file in path.iterdir()) == [
+        "README.md",
+        "adapter_config.json",
+        "adapter_model.safetensors",
+    ]
+    artifact = load_artifact(path, "gpt", ADAPTER)
+    assert artifact.config == CONFIG and torch.equal(artifact.tensors["w"], torch.ones(2, 3))
+    header = json.loads((path / "adapter_config.json").read_text())
+    assert (header["peft_type"], header["r"]) == ("LORA", 8)
+    with pytest.raises(CheckpointError, match=r"has no config\.json"):
+        load_artifact(path)
+    with pytest.raises(CheckpointError, match=r"holds a README\.md that kinetok did not write"):
+        save(path)  # an artifact of the other kind may not take over the card
+    with pytest.raises(ValueError, match="extra may not hold hash, kind: kinetok writes these keys itself"):
+        save(path, files=ADAPTER, extra={"kind": "x", "hash": "y"})
+    (path / "adapter_model.safetensors").write_bytes(b"cut")
+    with pytest.raises(CheckpointError, match=r"adapter_model\.safetensors is truncated or edited: .* adapter_config"):
+        load_artifact(path, "gpt", ADAPTER)
 
 
 def test_the_hash_depends_on_the_tensors_only(tmp_path):

@@ -1,0 +1,136 @@
+"""The token policy that reinforcement learning fine-tunes (GPC sec. 7.2, app. D.3).
+
+    drawn = draw(adapted, state, c, generator=generator, top_p=0.9)         # tokens, keep, log_prob
+    scored = score(adapted, state, c, drawn.tokens, drawn.keep)              # log_prob, entropy, with gradients
+
+Each choice is drawn from the adapted distribution restricted to the top-p nucleus of the frozen base, both given
+the same choices so far, and renormalised; log-probabilities, entropy and KL are those of that distribution, the
+one that acted. The nucleus is the base's alone: it does not move while the adapter learns, so a rollout keeps it
+as a mask. An action is the S tokens of a control step, and its log-probability the sum over them.
+
+The temperature divides the logits of both before anything else. Entropy and KL are sums, over the choices of the
+step, of those of the conditionals along the tokens drawn: unbiased for the step's by the chain rule, as the
+tokens come from the policy itself.
+
+Knows neither rewards nor advantages.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kinetok.adapters.adapted import Adapted
+from kinetok.gpt.cache import KVCache
+from kinetok.gpt.sample import draw as option_at
+from kinetok.gpt.sample import nucleus, restrict
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """tokens: (N, S) int64. keep: (N, S, D, K) bool, the options of each choice that the base's nucleus left.
+    log_prob: (N, S), of each token under the distribution it was drawn from, in nats."""
+
+    tokens: Tensor
+    keep: Tensor
+    log_prob: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """log_prob: (N,), of the tokens of a step. entropy: (N,). kl: (N,), from the base restricted to the same
+    options, or None where it was not asked for. All in nats, of one control step."""
+
+    log_prob: Tensor
+    entropy: Tensor
+    kl: Tensor | None
+
+
+def new_caches(adapted: Adapted, rows: int) -> tuple[KVCache, KVCache]:
+    """Caches of the base and of the adapted model for `rows` characters, to reuse from step to step."""
+    return adapted.new_cache(rows), adapted.new_cache(rows)
+
+
+@torch.no_grad()
+def draw(
+    adapted: Adapted,
+    state: Tensor,
+    c: Tensor | None,
+    *,
+    generator: torch.Generator | None = None,
+    top_p: float = 0.9,
+    temperature: float = 1.0,
+    greedy: bool = False,
+    caches: tuple[KVCache, KVCache] | None = None,
+) -> Drawn:
+    """Draw the tokens of one control step for state (N, state_dim) and c (N, cond_dim).
+
+    generator: source of the uniform numbers; needed unless `greedy`, which takes the most probable option left.
+    top_p: mass of the base's nucleus; 1 keeps every option. caches: of `new_caches(adapted, N)`.
+    """
+    _check(adapted, temperature)
+    if generator is None and not greedy:
+        raise ValueError("drawing needs generator=torch.Generator(...); or pass greedy=True")
+    base, rows = adapted.base, len(state)
+    for_base, for_bent = caches or new_caches(adapted, rows)
+    if for_base.rows != rows:
+        raise ValueError(
+            f"the caches hold {for_base.rows} rows and the state has {rows}; make new_caches(adapted, {rows})"
+        )
+    steps, choices, options = base.config.tokens_per_step, base.head.choices, base.head.options
+    uniform = None if greedy else torch.rand(rows, steps, choices, generator=generator, device=state.device)
+    tokens = torch.empty(rows, steps, dtype=torch.int64, device=state.device)
+    keep = torch.empty(rows, steps, choices, options, dtype=torch.bool, device=state.device)
+    log_prob = torch.zeros(rows, steps, dtype=state.dtype, device=state.device)
+    for j in range(steps):
+        x = base.head.begin(base.begin(state, for_base) if j == 0 else base.advance(tokens[:, j - 1], for_base))
+        h = adapted.begin(state, c, for_bent) if j == 0 else adapted.advance(tokens[:, j - 1], for_bent)
+        y, token = adapted.head.begin(h), 0
+        for d in range(choices):
+            kept = nucleus(base.head.logits(x, d) / temperature, top_p)
+            logits = restrict(adapted.head.logits(y, d) / temperature, kept)
+            chosen = logits.argmax(-1) if uniform is None else option_at(logits, uniform[:, j, d])
+            log_prob[:, j] += logits.gather(-1, chosen[:, None]).squeeze(-1) - logits.logsumexp(-1)
+            keep[:, j, d], token = kept, token * options + chosen
+            x, y = base.head.push(x, d, chosen), adapted.head.push(y, d, chosen)
+        tokens[:, j] = token
+    return Drawn(tokens=tokens, keep=keep, log_prob=log_prob)
+
+
+def score(
+    adapted: Adapted,
+    state: Tensor,
+    c: Tensor | None,
+    tokens: Tensor,
+    keep: Tensor,
+    *,
+    temperature: float = 1.0,
+    reference: bool = False,
+) -> Scored:
+    """What the policy says now of tokens (N, S) drawn with the mask keep (N, S, D, K), differentiably.
+
+    One teacher-forced pass; reference: with the KL from the base, at the cost of a second without gradient.
+    """
+    _check(adapted, temperature)
+    log_p = F.log_softmax(restrict(adapted(state, c, tokens) / temperature, keep), dim=-1)
+    taken = log_p.gather(-1, adapted.base.split(tokens)[..., None])
+    log_p = log_p.masked_fill(~keep, 0.0)  # where p = 0: p log p is 0, not nan
+    p = log_p.exp() * keep
+    kl = None
+    if reference:
+        with torch.no_grad():
+            log_q = F.log_softmax(restrict(adapted.base(state, tokens) / temperature, keep), dim=-1)
+        kl = (p * (log_p - log_q.masked_fill(~keep, 0.0))).sum((1, 2, 3))
+    return Scored(log_prob=taken.sum((1, 2, 3)), entropy=-(p * log_p).sum((1, 2, 3)), kl=kl)
+
+
+def _check(adapted: Adapted, temperature: float) -> None:
+    if temperature <= 0.0:
+        raise ValueError(f"temperature must be above 0, not {temperature}; for the most probable pass greedy=True")
+    drops = adapted.training and any(isinstance(m, torch.nn.Dropout) and m.p > 0.0 for m in adapted.gpt.modules())
+    if drops:
+        raise ValueError(
+            "the adapted model is in training mode and drops units out, so its log-probabilities are not those of the "
+            "policy that acts; call adapted.eval(), in which gradients flow as well"
+        )

@@ -1,0 +1,186 @@
+"""Reinforcement learning fine-tuning: PPO over the tokens of a control step (GPC sec. 7.2, app. D).
+
+    policy = TokenPolicy(adapted, prior.tokenizer, task.layout, TokenPolicyConfig())
+    score = play(policy.controller(generator), task_config, prior, episodes=64)
+
+An action is the S tokens of a step; its log-probability is the sum over them, its advantage one for all. The
+frozen prior's nucleus bounds what may be drawn (policy.py). `play` measures any controller on a task: a fine-tuned
+prior, the prior alone, a network that knows no tokens.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kinetok.adapters.adapted import Adapted
+from kinetok.adapters.policy import draw, new_caches, score
+from kinetok.gpt.controller import Prior
+from kinetok.gpt.data import Starts
+from kinetok.rl.policy import Assessment
+from kinetok.rl.rollout import torch_threads
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks import Goal, GoalConfig, Marker, Scorecard, build_task
+from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+Controller = Callable[[Tensor], Tensor]  # observations (N, O) -> PD targets (N, nu)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TokenPolicyConfig:
+    """top_p: mass of the frozen prior's nucleus, 1 for no bound; temperature; kl: weight of the divergence from the
+    prior in the loss; entropy: weight of the bonus (NCP: top_p 1, kl 0.05, entropy 0.01)."""
+
+    top_p: float = 0.9
+    temperature: float = 1.0
+    kl: float = 0.0
+    entropy: float = 0.0
+
+
+class TokenPolicy:
+    """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them.
+
+    layout: columns of the observation, "state" and "task"."""
+
+    def __init__(
+        self, adapted: Adapted, tokenizer: MotionTokenizer, layout: dict[str, slice], config: TokenPolicyConfig
+    ):
+        self.adapted, self.tokenizer, self.layout, self.config = adapted, tokenizer, layout, config
+        self.tokens = tokenizer.layout
+        self._caches = new_caches(adapted, 1)
+
+    def draw(self, obs: Tensor, generator: torch.Generator | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """PD targets (N, nu) and the tokens behind them; without a generator the most probable ones."""
+        if self._caches[0].rows != len(obs):
+            self._caches = new_caches(self.adapted, len(obs))
+        state, c = self._parts(obs)
+        drawn = draw(
+            self.adapted,
+            state,
+            c,
+            generator=generator,
+            top_p=self.config.top_p,
+            temperature=self.config.temperature,
+            greedy=generator is None,
+            caches=self._caches,
+        )
+        action = self.tokenizer.decode(self.tokens.to_codes(drawn.tokens), state)
+        return action, {"tokens": drawn.tokens, "keep": drawn.keep, "log_prob": drawn.log_prob.sum(-1)}
+
+    def assess(self, obs: Tensor, taken: dict[str, Tensor]) -> Assessment:
+        config, (state, c) = self.config, self._parts(obs)
+        found = score(
+            self.adapted,
+            state,
+            c,
+            taken["tokens"],
+            taken["keep"],
+            temperature=config.temperature,
+            reference=config.kl > 0,
+        )
+        entropy = found.entropy.mean()
+        loss, metrics = -config.entropy * entropy, {"entropy": entropy.detach()}
+        if found.kl is not None:
+            loss, metrics = loss + config.kl * found.kl.mean(), metrics | {"kl_prior": found.kl.mean().detach()}
+        # Schulman's low-variance estimate of KL(then || now), from what was drawn then.
+        change = (found.log_prob - taken["log_prob"]).detach()
+        return Assessment(log_prob=found.log_prob, kl=(change.exp() - 1 - change).mean(), loss=loss, metrics=metrics)
+
+    def observe(self, obs: Tensor) -> None:
+        self.adapted.observe(obs[..., self.layout["task"]])
+
+    def parameters(self) -> Iterable[nn.Parameter]:
+        return self.adapted.trainable()
+
+    def controller(self, generator: torch.Generator | None) -> Controller:
+        """The policy as it is played; without a generator greedily."""
+        return lambda obs: self.draw(obs, generator)[0]
+
+    def _parts(self, obs: Tensor) -> tuple[Tensor, Tensor | None]:
+        c = obs[:, self.layout["task"]] if self.adapted.cond_dim else None
+        return obs[:, self.layout["state"]], c
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskScore:
+    """measures: of a Scorecard. merit: its mean reward a step, in which a fallen row earns what it earns."""
+
+    measures: dict[str, Any]
+
+    @property
+    def merit(self) -> float:
+        return self.measures["return"]
+
+    def summary(self) -> dict[str, float]:
+        return {name: value for name, value in self.measures.items() if isinstance(value, float)}
+
+    def to_json(self) -> dict:
+        return {"measures": self.measures}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Played:
+    """score; qpos (T, K, nq) and markers (T lists) of the first K = `record` rows, in frames of `fps`."""
+
+    score: TaskScore
+    qpos: np.ndarray
+    markers: list[list[Marker]]
+    fps: int
+
+
+def standing(starts: Starts, fall_height: float) -> tuple[np.ndarray, np.ndarray]:
+    """qpos (K, nq), qvel (K, nv) of the start states whose root is above fall_height."""
+    up = starts.qpos[:, 2] >= fall_height
+    if not up.any():
+        raise ValueError(f"none of the prior's {len(up)} start states has its root above fall_height {fall_height} m")
+    return starts.qpos[up], starts.qvel[up]
+
+
+def task_of(config: GoalConfig, prior: Prior, rows: int, starts: np.ndarray | None = None) -> Goal:
+    """The task in the prior's body and at its rate, from its upright start states."""
+    qpos, qvel = standing(prior.starts, config.fall_height)
+    return build_task(config, prior.character, qpos, qvel, rows=rows, starts=starts, control_hz=prior.fps)
+
+
+def play(
+    controller: Controller,
+    config: GoalConfig,
+    prior: Prior,
+    *,
+    episodes: int = 64,
+    seconds: float = 20.0,
+    push: float = 0.0,
+    push_seconds: float = 2.0,
+    seed: int = 0,
+    threads: int = 0,
+    record: int = 0,
+) -> Played:
+    """Let `episodes` characters do the task for `seconds` without resets, and measure. record: rows to keep for a
+    video. push: m/s added to the root's horizontal velocity every push_seconds."""
+    task = task_of(config, prior, episodes)
+    world = EnvConfig(
+        scene=prior.tokenizer.config.scene,
+        episode_seconds=seconds + 1,
+        push=push,
+        push_seconds=push_seconds,
+        push_regular=True,
+        autoreset=False,
+    )
+    env = Env(world, task, rows=episodes, threads=threads, seed=seed)
+    card = Scorecard(rows=episodes, control_hz=prior.fps)
+    obs = env.reset()
+    qpos: list[np.ndarray] = []
+    markers: list[list[Marker]] = []
+    with torch.no_grad(), torch_threads(1):
+        for _ in range(round(seconds * prior.fps)):
+            if record:
+                qpos.append(env.sim.qpos[:record].copy())
+                markers.append([marker for row in range(record) for marker in task.markers(row)])
+            step = env.step(controller(torch.from_numpy(obs)).numpy())
+            card.add(step.reward, step.terminated, task.measure(env.sim.state()))
+            obs = step.obs
+    frames = np.stack(qpos) if qpos else np.empty((0, 0, prior.character.nq))
+    return Played(score=TaskScore(measures=card.summary()), qpos=frames, markers=markers, fps=prior.fps)
