@@ -69,10 +69,14 @@ def configured(presets: str):
     return decorate
 
 
-def load_clips(paths: tuple[Path, ...]):
+def load_clips(paths: tuple[Path, ...], character: str | None = None, fps: float | None = None):
     from kinetok.motion.formats import read_clips
 
-    return [clip for path in paths for clip in read_clips(path)]
+    found = [clip for path in paths for clip in read_clips(path, character, fps=fps)]
+    for clip in found:
+        if "assumed" in clip.source:
+            click.echo(f"{clip.name}: {clip.source}", err=True)
+    return found
 
 
 def check_suffix(out: Path, *allowed: str) -> None:
@@ -135,14 +139,71 @@ def clips_info(paths: tuple[Path, ...]) -> None:
 @clips.command("import")
 @click.argument("paths", nargs=-1, required=True, type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
-def clips_import(paths: tuple[Path, ...], out: Path) -> None:
-    """Read motion files of any known format and write one memory-mapped library."""
+@click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
+@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
+def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps: float | None) -> None:
+    """Read motion files of any known format and write one memory-mapped library.
+
+    \b
+    BVH, ASF/AMC, AMASS npz, poselib npy          retargeted to --character
+    DeepMimic txt, robot CSV, MimicKit, GMR, ...  of the body they were made for
+    """
     from kinetok.motion.library import ClipLibrary
 
     check_suffix(out, ".safetensors")
-    found = load_clips(paths)
+    found = load_clips(paths, character, fps)
     ClipLibrary.write(out, found)
     click.echo(f"wrote {out}: {len(found)} clips, {sum(c.seconds for c in found):.1f} s")
+
+
+@clips.command("export")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="File to write: .bvh, .csv (robot) or .npz (AMASS-like).")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+def clips_export(source: Path, out: Path, name: str | None) -> None:
+    """Write a clip, recorded or simulated, for Blender (.bvh), a robot (.csv) or SMPL tools (.npz)."""
+    from kinetok.motion.character import Character
+    from kinetok.motion.export import skeleton_motion
+    from kinetok.motion.formats.amass import write_amass
+    from kinetok.motion.formats.bvh import write_bvh
+    from kinetok.motion.formats.robot_csv import write_robot_csv
+
+    check_suffix(out, ".bvh", ".csv", ".npz")
+    clip = one_clip(source, name)
+    if out.suffix == ".csv":
+        write_robot_csv(out, clip)
+    else:
+        motion = skeleton_motion(Character.load(clip.character), clip)
+        (write_bvh if out.suffix == ".bvh" else write_amass)(out, motion)
+    click.echo(f"wrote {out}: {clip.name}, {len(clip.qpos)} frames at {clip.fps:g} fps")
+
+
+@clips.command("play")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="Video to write, ending in .mp4.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+@click.option("--seconds", type=float, default=None, help="How much of it; default all, a loop three times.")
+def clips_play(source: Path, out: Path, name: str | None, seconds: float | None) -> None:
+    """Render a motion file to a video, as it was recorded and without physics."""
+    import numpy as np
+
+    check_suffix(out, ".mp4")
+    clip = one_clip(source, name)
+    seconds = seconds or clip.seconds * (3 if clip.loop else 1)
+    write_motion(out, clip.character, clip.at(np.arange(0, seconds, 1 / 30)), 30.0, clip.name, caption=clip.name)
+
+
+def one_clip(source: Path, name: str | None):
+    """The clip of that name in a file or library, or its only one."""
+    from kinetok.config import nearest
+
+    found = load_clips((source,))
+    names = [clip.name for clip in found]
+    if name is None and len(found) > 1:
+        raise ValueError(f"{source} holds {len(found)} clips; choose one with --name: {', '.join(names[:12])}")
+    if name is not None and name not in names:
+        raise ValueError(f"{source} holds no clip {name!r}{nearest(name, names)}")
+    return found[names.index(name) if name else 0]
 
 
 @main.group(cls=Chain)
