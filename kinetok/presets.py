@@ -9,6 +9,7 @@ from kinetok.adapters.cola import CoLAConfig
 from kinetok.adapters.finetune import FinetuneConfig
 from kinetok.adapters.sft import SFTConfig
 from kinetok.gpt.pretrain import PretrainConfig
+from kinetok.gpt.refine import RefineConfig
 from kinetok.rl.ppo import PPOConfig
 from kinetok.sim.env import EnvConfig
 from kinetok.tokenizers.distill import DistillStage
@@ -90,7 +91,9 @@ FIT = {"one-clip": one_clip, "many-clips": many_clips, "from-scratch": from_scra
 
 def laptop() -> PretrainConfig:
     """A prior in a quarter of an hour on two cores."""
-    return PretrainConfig(width=128, layers=3, samples=300_000, iterations=2500, batch=512)
+    return PretrainConfig(
+        width=128, layers=3, samples=300_000, iterations=2500, batch=512, code_noise=0.05, refine=RefineConfig()
+    )
 
 
 def paper() -> PretrainConfig:
@@ -101,7 +104,16 @@ def paper() -> PretrainConfig:
 def tiny_prior() -> PretrainConfig:
     """Seconds, for tests."""
     return PretrainConfig(
-        width=16, layers=1, heads=2, samples=640, rows=32, iterations=20, batch=32, warmup=2, eval_every=10
+        width=16,
+        layers=1,
+        heads=2,
+        samples=640,
+        rows=32,
+        iterations=20,
+        batch=32,
+        warmup=2,
+        eval_every=10,
+        refine=RefineConfig(rounds=1, rows=8, seconds=1.0, iterations=4, batch=16, episodes=4, survive=1.0),
     )
 
 

@@ -24,11 +24,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
+from kinetok.checkpoint import CheckpointError, flatten, load_artifact, load_state, save_state, unflatten
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.data import TokenDataset, record
 from kinetok.gpt.model import GPT, GPTConfig
+from kinetok.gpt.refine import RefineConfig, refine
 from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
@@ -78,6 +79,7 @@ class PretrainConfig:
     state_noise: float = 0.02
     held_out: float = 0.05
     eval_every: int = 500
+    refine: RefineConfig = RefineConfig(rounds=0)
 
     def gpt(self, layout: TokenLayout, state_dim: int) -> GPTConfig:
         """The shape of the GPT for these tokens and states."""
@@ -129,17 +131,32 @@ def pretrain(
     gpt = GPT(config.gpt(tokenizer.layout, data.states.shape[1]))
     gpt.set_state_statistics_(*data.statistics())
 
-    def save(average: GPT, metrics: dict[str, float]) -> None:
+    plain = out / "plain" if config.refine.rounds else out
+
+    def save(average: GPT, metrics: dict[str, float], where: Path = plain) -> None:
         prior = Prior(
             gpt=average,
             tokenizer=tokenizer,
-            tokenizer_path=noted_path(tokenizer_path, out) if tokenizer_path else "",
+            tokenizer_path=noted_path(tokenizer_path, where) if tokenizer_path else "",
             clips=data.names,
             starts=data.starts,
         )
-        prior.save_pretrained(out, prior_card(prior, config, data, metrics, seed))
+        prior.save_pretrained(where, prior_card(prior, config, data, metrics, seed))
 
-    train(gpt, data, config, out, identity=identity, save=save, seed=seed, threads=threads, quiet=quiet)
+    best = train(gpt, data, config, out, identity=identity, save=save, seed=seed, threads=threads, quiet=quiet)
+    if config.refine.rounds:
+        prior = Prior.from_pretrained(plain, tokenizer)
+        refine(
+            prior,
+            data,
+            config.refine,
+            out / "refine",
+            identity=identity | {"stage": to_dict(config.refine), "plain": load_artifact(plain).hash},
+            save=lambda refined, metrics: save(refined.gpt, best | metrics, out),
+            seed=seed,
+            threads=threads,
+            quiet=quiet,
+        )
     return Prior.from_pretrained(out, tokenizer)
 
 
@@ -169,7 +186,7 @@ def train(
     path, step, best = out / "state.safetensors", 0, {"held_out/cross_entropy": math.inf}
     if path.exists():
         tensors, meta = load_state(path)
-        _same_run(path, meta["identity"], identity, config, list(to_dict(config)))
+        _same_run(path, meta["identity"], identity, config, [key for key in to_dict(config) if key != "refine"])
         tree = unflatten(tensors, meta["tree"])
         gpt.load_state_dict(tree["gpt"])
         average.load_state_dict(tree["average"])
@@ -322,6 +339,12 @@ def prior_card(prior: Prior, config: PretrainConfig, data: TokenDataset, metrics
         if "held_out/accuracy" in metrics
         else f"Nothing was held out; iteration {metrics['iteration']:.0f} of {config.iterations}."
     )
+    refined = (
+        f"round {metrics['round'] + 1:.0f} of {config.refine.rounds}, survival {metrics['survival']:.0%} of "
+        f"{config.refine.episodes} episodes of 20 s"
+        if "round" in metrics
+        else "no"
+    )
     return f"""# Motion prior for `{prior.tokenizer.config.character}`
 
 A GPT that predicts the motion tokens of a control step from the character's state, {prior.fps} times a second; the
@@ -337,6 +360,7 @@ frozen tokenizer {prior.tokenizer.hash[:12]} turns them into joint torques.
 - Clips: {", ".join(prior.clips)}.
 - Training: {config.iterations} iterations of {config.batch}, AdamW {config.lr}, label smoothing
   {config.label_smoothing}, EMA {config.ema}, state noise {config.state_noise}.
+- Refined by its own roll-outs: {refined}.
 - It holds {len(prior.starts.qpos)} start states of the clips, so that it runs without them.
 
 {held}
