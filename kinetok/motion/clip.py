@@ -15,6 +15,8 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.character import Character
 
+MIRRORED = "-mirrored"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Clip:
@@ -87,6 +89,11 @@ class Clip:
             raise ValueError(f"clip {self.name!r}: [{start}, {stop}] s is not within [0, {self.seconds:.3f}] s")
         first, last = round(start * self.fps), round(stop * self.fps)
         return replace(self, qpos=self.qpos[first : last + 1], loop=False)
+
+    def mirror(self) -> "Clip":
+        """The same motion with left and right exchanged, reflected at the x-z plane; twice is the motion itself."""
+        name = self.name.removesuffix(MIRRORED) if self.name.endswith(MIRRORED) else self.name + MIRRORED
+        return replace(self, name=name, qpos=Character.load(self.character).mirror_qpos(self.qpos))
 
 
 def quaternion_columns(body: Character) -> np.ndarray:

@@ -22,6 +22,7 @@ from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import refuse_changed
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.symmetry import Mirror
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.track import TrackingScore, track
 from kinetok.tokenizers.train import KINDS, identify, in_scene
@@ -58,16 +59,21 @@ def distill(
     seed: int = 0,
     threads: int = 0,
     card: Callable[[TrackingScore], str] = lambda score: "",
+    mirrored: Sequence[bool] = (),
     parents: dict[str, str] | None = None,
     quiet: bool = False,
 ) -> TrackingScore:
-    """Train `student` in place; returns the score of the best artifact, which lies in `out`."""
+    """Train `student` in place; returns the score of the best artifact, which lies in `out`.
+
+    mirrored: which clips are the mirror images of what their teacher knows; empty for none.
+    """
     if len(teachers) != len(table.names):
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
     task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
-    views = [_View(teacher, task) for teacher in teachers]
+    flags = mirrored or [False] * len(teachers)
+    views = [_View(teacher, task, flag) for teacher, flag in zip(teachers, flags, strict=True)]
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
     identity = identify(config, student.config, table.names, seed)
@@ -142,12 +148,12 @@ def distill(
 
 
 class _View:
-    """A teacher with its own future window, seen through the student's observations.
+    """A teacher with its own future window, seen through the student's observations, or through a mirror.
 
     The teacher's window frames must be among the student's; its observation is a selection of columns.
     """
 
-    def __init__(self, teacher: MotionTokenizer, task: Tracking):
+    def __init__(self, teacher: MotionTokenizer, task: Tracking, mirrored: bool):
         missing = set(teacher.config.future) - set(task.config.future)
         if missing:
             raise ValueError(f"teacher looks {sorted(missing)} steps ahead, the student only {task.config.future}")
@@ -156,9 +162,13 @@ class _View:
         picked = columns[[task.config.future.index(f) for f in teacher.config.future]].flatten()
         before, after = torch.arange(window.start), torch.arange(window.stop, task.obs_size)
         self.teacher, self.columns = teacher.eval(), torch.cat([before, picked, after])
+        self.mirror = Mirror.of(teacher.config.character, teacher.config.future) if mirrored else None
 
     def act(self, obs: Tensor) -> Tensor:
-        return self.teacher.act(obs[:, self.columns])[0]
+        seen = obs[:, self.columns]
+        if self.mirror is None:
+            return self.teacher.act(seen)[0]
+        return self.mirror.action(self.teacher.act(self.mirror.observation(seen))[0])
 
 
 def _label(views: list[_View], obs: Tensor, task: Tracking) -> Tensor:

@@ -63,7 +63,8 @@ def _polish() -> PPOStage:
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """stages; tokenizer: the student; teacher_tokenizer: its experts; the three stages' own settings; workers:
+    """stages; tokenizer: the student; teacher_tokenizer: its experts; the three stages' own settings; mirror: the
+    student learns every clip's mirror image too, from the same teacher; workers:
     teachers that train at once."""
 
     stages: tuple[str, ...] = STAGES
@@ -72,6 +73,7 @@ class FitConfig:
     teacher: PPOStage = PPOStage(env=EnvConfig(reset_noise=0.02, push=0.5), stop_success=1.0, stop_mpjpe_mm=40.0)
     distill: DistillStage = DistillStage()
     ppo: PPOStage = field(default_factory=_polish)
+    mirror: bool = False
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -121,7 +123,8 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ConfigError(f"two clips are named {twice!r}; rename a file, the name says which teacher is whose")
-    table = ReferenceTable(library, control_hz=config.tokenizer.scene.control_hz)
+    images = [clip.mirror() for clip in clips] if config.mirror else []
+    table = ReferenceTable(ClipLibrary.of([*clips, *images]), control_hz=config.tokenizer.scene.control_hz)
     student = new_tokenizer(config.tokenizer, table, seed)
     if student.quantizer.levels:
         student.layout  # noqa: B018  refuses codes that do not divide into tokens, before hours of training
@@ -138,13 +141,14 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         story = ["teacher", "distill"]
         scores["distill"] = distill(
             student,
-            teachers,
+            teachers * 2 if images else teachers,
             table,
             config.distill,
             out / "distill",
             seed=seed,
             threads=threads,
-            card=lambda score: tokenizer_card(student, names, "teacher -> distill", seed, score),
+            card=lambda score: tokenizer_card(student, table.names, "teacher -> distill", seed, score),
+            mirrored=[False] * len(clips) + [True] * len(images),
             parents=parents,
         )
     if "ppo" in config.stages:
@@ -157,7 +161,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             seed=seed,
             threads=threads,
             title="ppo through the bottleneck",
-            card=lambda score: tokenizer_card(student, names, " -> ".join(story), seed, score),
+            card=lambda score: tokenizer_card(student, table.names, " -> ".join(story), seed, score),
         )
     if not scores:
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])

@@ -60,6 +60,22 @@ def test_slice(humanoid):
     np.testing.assert_allclose(part.qpos[:, 0], [0.2, 0.3, 0.4, 0.5])
 
 
+def test_mirror_twice_is_the_clip_itself(walk, humanoid):
+    mirrored = walk.mirror()
+    assert (mirrored.name, mirrored.loop, mirrored.fps, mirrored.source) == (
+        "walk-mirrored",
+        True,
+        walk.fps,
+        walk.source,
+    )
+    assert mirrored.mirror().name == "walk"
+    np.testing.assert_allclose(mirrored.mirror().qpos, walk.qpos, atol=1e-12)
+    left, right = (int(humanoid.model.joint(f"{side}_knee").qposadr[0]) for side in ("left", "right"))
+    np.testing.assert_allclose(mirrored.qpos[:, left], walk.qpos[:, right], atol=1e-12)
+    np.testing.assert_allclose(mirrored.qpos[:, :3], walk.qpos[:, :3] * [1, -1, 1], atol=1e-12)
+    np.testing.assert_allclose(rotation.heading(mirrored.qpos[:, 3:7]), -rotation.heading(walk.qpos[:, 3:7]), atol=1e-9)
+
+
 def test_close_loop_ends_where_it_begins(humanoid):
     qpos = poses(humanoid, 21)
     closed = close_loop(humanoid, qpos, 5)
