@@ -5,7 +5,7 @@
     motion.joints[rig.parts["left_thigh"]], rig.how
 
 A part is named by the joint at its upper end: "left_shin" is the knee, "left_foot" the ankle, "left_hand" the
-wrist. Toes and head may be missing; the chest is the joint at which both arms meet where no name says so.
+wrist. Toes and head may be missing; the chest is the joint at which both arms meet, unless it is given.
 A rig with other parts missing is refused with what is missing and what there is. Names only, no motion.
 """
 
@@ -31,53 +31,54 @@ class Rig:
     how: str
 
 
-def _table(pelvis: str, chest: str, head: str, sides: tuple[str, str], **limbs: str) -> dict[str, str]:
+def _table(pelvis: str, head: str, sides: tuple[str, str], **limbs: str) -> dict[str, str]:
     """Part -> joint name; {} in a limb's name stands for the side's spelling."""
-    named = {"pelvis": pelvis, "chest": chest, "head": head}
+    named = {"pelvis": pelvis, "head": head}
     for side, spelling in zip(("left", "right"), sides, strict=True):
         named |= {f"{side}_{limb}": name.format(spelling) for limb, name in limbs.items()}
-    return {part: name for part, name in named.items() if name}
+    return named
 
 
+_LEFT_RIGHT = ("Left", "Right")
+# MotionBuilder, Mixamo, HumanIK; joints of no length (LHipJoint, LowerBack) are passed over
 _MOTIONBUILDER = {
     "thigh": "{}UpLeg", "shin": "{}Leg", "foot": "{}Foot", "toe": "{}ToeBase",
     "upper_arm": "{}Arm", "lower_arm": "{}ForeArm", "hand": "{}Hand",
 }  # fmt: skip
-_LEFT_RIGHT = ("Left", "Right")
+_MIXAMO = _table("Hips", "Head", _LEFT_RIGHT, **_MOTIONBUILDER)
 
 RIGS: dict[str, dict[str, str]] = {
+    "mixamo-like": _MIXAMO,
+    "cmu-motionbuilder": _MIXAMO,
+    "fair1": _MIXAMO,
+    "pymo": _MIXAMO,
     "cmu-daz": _table(
-        "hip", "chest", "head", ("l", "r"),
+        "hip", "head", ("l", "r"),
         thigh="{}Thigh", shin="{}Shin", foot="{}Foot", upper_arm="{}Shldr", lower_arm="{}ForeArm", hand="{}Hand",
     ),
-    # names of the hierarchy shared by MotionBuilder, Mixamo and HumanIK; zero-length LHipJoint and LowerBack are skipped
-    "cmu-motionbuilder": _table("Hips", "Spine1", "Head", _LEFT_RIGHT, **_MOTIONBUILDER),
     # here LeftHip is the thigh and LeftShoulder the upper arm
     "cmu-3dsmax": _table(
-        "Hips", "Chest2", "Head", _LEFT_RIGHT,
+        "Hips", "Head", _LEFT_RIGHT,
         thigh="{}Hip", shin="{}Knee", foot="{}Ankle", toe="{}Toe",
         upper_arm="{}Shoulder", lower_arm="{}Elbow", hand="{}Wrist",
     ),
-    "mixamo-like": _table("Hips", "Spine2", "Head", _LEFT_RIGHT, **_MOTIONBUILDER),
-    "fair1": _table("Hips", "Spine3", "Head", _LEFT_RIGHT, **_MOTIONBUILDER),
-    "pymo": _table("Hips", "Spine", "Head", _LEFT_RIGHT, **_MOTIONBUILDER),
     "snu-mass": _table(
-        "Character1_Hips", "Character1_Spine1", "Character1_Head", _LEFT_RIGHT,
+        "Character1_Hips", "Character1_Head", _LEFT_RIGHT,
         **{limb: "Character1_" + name for limb, name in _MOTIONBUILDER.items()},
     ),
     "cmu-asf": _table(
-        "root", "thorax", "head", ("l", "r"),
+        "root", "head", ("l", "r"),
         thigh="{}femur", shin="{}tibia", foot="{}foot", toe="{}toes",
         upper_arm="{}humerus", lower_arm="{}radius", hand="{}wrist",
     ),
     # SMPL's foot joint is the ball of the foot
     "smpl": _table(
-        "pelvis", "spine3", "head", ("left", "right"),
+        "pelvis", "head", ("left", "right"),
         thigh="{}_hip", shin="{}_knee", foot="{}_ankle", toe="{}_foot",
         upper_arm="{}_shoulder", lower_arm="{}_elbow", hand="{}_wrist",
     ),
     "amp": _table(
-        "pelvis", "torso", "head", ("left", "right"),
+        "pelvis", "head", ("left", "right"),
         thigh="{}_thigh", shin="{}_shin", foot="{}_foot",
         upper_arm="{}_upper_arm", lower_arm="{}_lower_arm", hand="{}_hand",
     ),

@@ -6,7 +6,7 @@ The file is y up and faces +x; its joints are those of the built-in humanoid. Re
 quaternions, aligns their signs, resamples uneven frame durations to the median rate, closes the cycle of a
 "wrap" loop over its last quarter second (many files miss their own start by up to one radian) and puts the
 lowest foot on the ground. Refused, naming file, frame and column: anything but numbers, other column counts,
-values that are not finite, zero quaternions, fewer than two frames of positive duration.
+values that are not finite or beyond a million, zero quaternions, fewer than two frames of positive duration.
 """
 
 import json
@@ -28,6 +28,8 @@ JOINTS = (
     ("left_hip", 4, 0), ("left_knee", 1, -1), ("left_ankle", 4, 0), ("left_shoulder", 4, 0), ("left_elbow", 1, 1),
 )  # fmt: skip
 CLOSE_SECONDS = 0.25
+LARGEST = 1e6
+STRETCH = 100  # times the frames of the file: more than that does resampling not make
 
 
 def is_deepmimic(path: Path) -> bool:
@@ -50,7 +52,7 @@ def read_deepmimic(path: Path, *, close: bool = True) -> Clip:
         raise FormatError(path, "Frames", "fewer than two frames of positive duration; there is no motion")
     fps = 1 / float(np.median(np.diff(times)))
     if np.ptp(np.diff(times)) > 1e-6:
-        qpos = _resample(body, qpos, times, fps)
+        qpos = _resample(path, body, qpos, times, fps)
     if loop and close:
         qpos = close_loop(body, qpos, max(1, round(CLOSE_SECONDS * fps)))
     qpos[:, 2] -= np.percentile(lowest_point(body, qpos), 5)
@@ -61,7 +63,7 @@ def read_deepmimic(path: Path, *, close: bool = True) -> Clip:
 def _parse(path: Path) -> tuple[bool, np.ndarray]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(path, f"line {getattr(error, 'lineno', '?')}", f"not JSON: {error}") from None
     if not isinstance(data, dict) or "Frames" not in data:
         raise FormatError(path, "top level", 'no "Frames"; a DeepMimic file is {"Loop": ..., "Frames": [[...], ...]}')
@@ -84,6 +86,9 @@ def _parse(path: Path) -> tuple[bool, np.ndarray]:
     if not np.isfinite(frames).all():
         frame, column = np.argwhere(~np.isfinite(frames))[0]
         raise FormatError(path, f"frame {frame}, column {column}", f"{frames[frame, column]} is not a finite number")
+    if (np.abs(frames) > LARGEST).any():
+        frame, column = np.argwhere(np.abs(frames) > LARGEST)[0]
+        raise FormatError(path, f"frame {frame}, column {column}", f"{frames[frame, column]:g} is no metre or radian")
     if (frames[:, 0] < 0).any():
         frame = int(np.argmax(frames[:, 0] < 0))
         raise FormatError(path, f"frame {frame}, column 0", f"duration {frames[frame, 0]} is negative")
@@ -118,7 +123,10 @@ def _to_qpos(path: Path, body: Character, values: np.ndarray) -> np.ndarray:
     return qpos
 
 
-def _resample(body: Character, qpos: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
+def _resample(path: Path, body: Character, qpos: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
+    if times[-1] * fps > STRETCH * len(times):
+        frame = int(np.diff(times).argmax())
+        raise FormatError(path, f"frame {frame}, column 0", f"{np.diff(times).max():g} s, where most take {1 / fps:g} s")
     wanted = np.arange(int(times[-1] * fps + 1e-6) + 1) / fps
     low = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(times) - 2)
     share = np.clip((wanted - times[low]) / (times[low + 1] - times[low]), 0, 1)

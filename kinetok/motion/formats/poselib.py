@@ -42,7 +42,7 @@ def read_poselib(path: Path) -> SkeletonMotion:
     offsets = _tensor(path, tree, "local_translation", (count, 3))
     raw = _tensor(path, data, "rotation", (None, count, 4))
     local = quaternions(path, "rotation.arr", raw, "xyzw")
-    if not data.get("is_local", True):
+    if "is_local" in data and not array(path, data, "is_local", ()):
         above = local[:, parents[1:].astype(int)]
         local[:, 1:] = rotation.align(rotation.multiply(rotation.conjugate(above), local[:, 1:]))
     return SkeletonMotion(

@@ -33,9 +33,9 @@ HINGE = mujoco.mjtJoint.mjJNT_HINGE
 class Figure:
     """Per part: bodies: index into body_names; centre (3,): its joint centre and frame (3, 3): its frame of
     source.py, both in the body's own frame; length: to the next part of its limb, metres. offset (3,): from the part
-    above to this one at rest, in that body's frame, for what does not bend: hips and chest from the pelvis (whose centre
-    is midway between the hips), shoulders from the chest. soles: side -> (K, 4) points of the foot's shape in its body's
-    frame, each with the radius around it."""
+    above to this one at rest, in that body's frame, for what does not bend: hips and chest from the pelvis (whose
+    centre is midway between the hips), shoulders from the chest. soles: side -> (K, 4) points of the foot's shape in
+    its body's frame, each with the radius around it."""
 
     character: Character = field(repr=False)
     bodies: dict[str, int]
@@ -58,7 +58,8 @@ def measure(character: Character) -> Figure:
     model, data = character.model, mujoco.MjData(character.model)
     mujoco.mj_kinematics(model, data)
     bodies = {part: index for part, index in parts.items() if part in (*NEEDED, "head")}
-    spot = {part: _centre(model, data, index + 1, bodies.get(ABOVE.get(part), -1) + 1) for part, index in bodies.items()}
+    tops = {part: bodies[ABOVE[part]] + 1 if part in ABOVE else 0 for part in bodies}
+    spot = {part: _centre(model, data, index + 1, tops[part]) for part, index in bodies.items()}
     spot["pelvis"] = (spot["left_thigh"] + spot["right_thigh"]) / 2
     standing = upright(spot["left_thigh"] - spot["right_thigh"], np.array([0.0, 0, 1]))
     frames, length, offset = {}, {}, {}
@@ -102,7 +103,7 @@ def _limb(name: str, parts: list[str], spot: dict[str, np.ndarray], flexion: np.
     bones = [spot[lower] - spot[upper] for upper, lower in zip(parts[:2], parts[1:], strict=True)]
     for part, bone in zip(parts, bones, strict=False):
         if np.linalg.norm(bone) < 0.01:
-            raise ConfigError(f"character {name!r}: {part} is shorter than 1 cm; look at its roles file, \"retarget\"")
+            raise ConfigError(f'character {name!r}: {part} is shorter than 1 cm; look at its roles file, "retarget"')
     upper, lower = (frame(bone, flexion) for bone in bones)
     return dict(zip(parts, (upper, lower, lower), strict=True))  # a hand goes on as its arm; feet are overwritten
 

@@ -1,7 +1,7 @@
 """How well a retargeted motion follows its plan, touches the ground and keeps to the joints' limits.
 
-    report = assess(clip, motion, rig, actor, figure, plan)
-    json.dumps(report.to_json())
+report = assess(clip, motion, rig, actor, figure, plan)
+json.dumps(report.to_json())
 """
 
 from dataclasses import asdict, dataclass
@@ -54,9 +54,7 @@ class RetargetReport:
         return asdict(self)
 
 
-def assess(
-    clip: Clip, motion: SkeletonMotion, rig: Rig, actor: Actor, figure: Figure, plan: Plan
-) -> RetargetReport:
+def assess(clip: Clip, motion: SkeletonMotion, rig: Rig, actor: Actor, figure: Figure, plan: Plan) -> RetargetReport:
     """Measure a clip of the figure's character that was made by a plan."""
     body = figure.character
     moved = kinematics(body, clip.qpos, clip.fps)

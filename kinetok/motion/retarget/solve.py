@@ -16,6 +16,7 @@ from kinetok.motion.character import Character
 from kinetok.motion.clip import quaternion_columns
 from kinetok.motion.kinematics import lowest_point
 from kinetok.motion.retarget.body import ABOVE, Figure
+from kinetok.motion.retarget.source import LIMBS, SIDES
 from kinetok.motion.retarget.targets import Plan, envelope
 
 # position per metre, orientation per radian
@@ -30,75 +31,103 @@ COSTS = {
     "lower_arm": (2.0, 0.2),
     "hand": (2.0, 0.2),
 }
+TOE_OUT = 0.7  # of a foot about its own vertical: ankles of robots do not turn that way, their hips would have to
 POSTURE, DAMPING = 1e-3, 1e-4
 AFRESH, EACH, DONE = 20, 6, 1e-4  # most iterations from rest and from the frame before; rad, the step that ends them
-LOST = 0.04  # m: a pose farther than this from its targets is looked for from rest as well
+LOST = 0.04  # m: a limb whose end is farther than this from its target is tried from rest as well
 FASTEST = 25.0  # rad/s of a hinge: hinges in a row would flip where their axes align
 
 
 def solve(figure: Figure, plan: Plan, fps: float) -> np.ndarray:
     """Poses (T, nq) of the character that follow the plan, at fps frames per second."""
-    try:
-        import daqp  # noqa: F401
-        import mink
-    except ImportError as error:
-        raise ImportError(
-            f"retargeting needs {error.name}, which is not installed: pip install 'kinetok[retarget]'"
-        ) from error
     body, model = figure.character, figure.character.model
     guess, known, turns = closed_form(figure, plan)
-    origins = {
-        part: place - rotation.rotate(turns[part], np.broadcast_to(figure.centre[part], place.shape))
-        for part, place in plan.places.items()
-    }
-    guess[:, :3] = origins["pelvis"]
-    tasks = {}
-    for part in turns:
-        place, turn = COSTS[part.removeprefix("left_").removeprefix("right_")]
-        tasks[part] = mink.FrameTask(
-            body.body_names[figure.bodies[part]], "body", place if part in origins else 0.0, turn
-        )
-    posture = mink.PostureTask(model, POSTURE)
-    posture.set_target(model.qpos0)
-    limits = [mink.ConfigurationLimit(model)]
-    configuration = mink.Configuration(model)
+    descent = Descent(figure, plan, turns)
+    guess[:, :3] = descent.origins["pelvis"]
     reach = np.full(model.nq, np.inf)
     reach[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = FASTEST / fps
-    placed = [task for part, task in tasks.items() if part in origins and task.cost[0] > 0]
-
-    def descend(start: np.ndarray, iterations: int, near: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-        """The pose (nq,) that iterations from `start` reach, hinges within `reach` of `near`, and its worst place (m)."""
-        configuration.update(start)
-        for _ in range(iterations):
-            step = mink.solve_ik(configuration, [*tasks.values(), posture], 1.0, "daqp", DAMPING, limits=limits)
-            configuration.integrate_inplace(step, 1.0)
-            if near is not None:
-                configuration.update(np.clip(configuration.q, near - reach, near + reach))
-            if np.abs(step).max() < DONE:
-                break
-        return configuration.q.copy(), max(
-            float(np.linalg.norm(task.compute_error(configuration)[:3])) for task in placed
-        )
-
     qpos = np.empty_like(guess)
-    for t in range(len(guess)):
-        for part, task in tasks.items():
-            where = origins[part][t] if part in origins else np.zeros(3)
-            task.set_target(mink.SE3(np.concatenate([turns[part][t], where])))
-        qpos[t], off = descend(np.where(known, guess[t], qpos[t - 1] if t else model.qpos0), EACH if t else AFRESH)
-        if t and off > LOST and not known.all():
-            other, better = descend(guess[t], AFRESH)
-            qpos[t] = other if better < off / 2 else qpos[t]
-        if t and (np.abs(qpos[t] - qpos[t - 1]) > reach).any():
-            qpos[t], _ = descend(np.clip(qpos[t], qpos[t - 1] - reach, qpos[t - 1] + reach), EACH, qpos[t - 1])
+    descent.aim(0)
+    qpos[0], _ = descent.run(guess[0], AFRESH)
+    for t in range(1, len(guess)):
+        descent.aim(t)
+        last, turned = qpos[t - 1], False
+        pose, far = descent.run(np.where(known, guess[t], last), EACH)
+        lost = far.max() > LOST
+        if lost and not known.all():
+            columns = np.any(
+                [limb for limb, off in zip(descent.limbs.values(), far, strict=True) if off > LOST], axis=0
+            )
+            other, better = descent.run(np.where(columns, guess[t], pose), AFRESH)
+            turned = bool(better.max() < far.max() / 2)
+            pose = other if turned else pose
+        if (np.abs(pose - last) > reach).any():
+            pose = np.clip(pose, last - reach, last + reach)
+            # on the way to another solution the targets would only pull back
+            pose = pose if turned else descent.run(pose, EACH, (last - reach, last + reach))[0]
+        qpos[t] = pose
     qpos = within_limits(model, qpos)
     columns = quaternion_columns(body)[:, None] + np.arange(4)
     qpos[:, columns] = rotation.align(rotation.normalize(qpos[:, columns]))
     return qpos
 
 
+class Descent:
+    """The quadratic programs of one plan. origins: part -> (T, 3), where bodies should be; limbs: see limb_columns."""
+
+    def __init__(self, figure: Figure, plan: Plan, turns: dict[str, np.ndarray]):
+        try:
+            import daqp  # noqa: F401
+            import mink
+        except ImportError as error:
+            raise ImportError(
+                f"retargeting needs {error.name}, which is not installed: pip install 'kinetok[retarget]'"
+            ) from error
+        model = figure.character.model
+        self.mink, self.turns, self.limbs = mink, turns, limb_columns(figure)
+        self.origins = {
+            part: place - rotation.rotate(turns[part], np.broadcast_to(figure.centre[part], place.shape))
+            for part, place in plan.places.items()
+        }
+        self.tasks = {}
+        for part in turns:
+            place, turn = COSTS[part.removeprefix("left_").removeprefix("right_")]
+            if part.endswith("foot"):
+                turn = turn - (turn - TOE_OUT) * figure.frame[part][:, 2] ** 2
+            name = figure.character.body_names[figure.bodies[part]]
+            self.tasks[part] = mink.FrameTask(name, "body", place, turn)
+        posture = mink.PostureTask(model, POSTURE)
+        posture.set_target(model.qpos0)
+        self.all = [*self.tasks.values(), posture]
+        self.limits = [mink.ConfigurationLimit(model)]
+        self.configuration = mink.Configuration(model)
+
+    def aim(self, t: int) -> None:
+        """Take the targets of frame t."""
+        for part, task in self.tasks.items():
+            where = self.origins[part][t] if part in self.origins else np.zeros(3)
+            task.set_target(self.mink.SE3(np.concatenate([self.turns[part][t], where])))
+
+    def run(
+        self, start: np.ndarray, iterations: int, bounds: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The pose (nq,) that iterations from `start` reach within bounds, and how far the ends of the limbs are from
+        their targets, metres."""
+        configuration = self.configuration
+        configuration.update(start)
+        for _ in range(iterations):
+            step = self.mink.solve_ik(configuration, self.all, 1.0, "daqp", DAMPING, limits=self.limits)
+            configuration.integrate_inplace(step, 1.0)
+            if bounds is not None:
+                configuration.update(np.clip(configuration.q, *bounds))
+            if np.abs(step).max() < DONE:
+                break
+        far = [np.linalg.norm(self.tasks[end].compute_error(configuration)[:3]) for end in self.limbs]
+        return configuration.q.copy(), np.array(far)
+
+
 def clear_floor(body: Character, qpos: np.ndarray, fps: float) -> np.ndarray:
-    """Poses (T, nq) raised, smoothly in time, where a body that is no foot (hands, knees, back) would be below z = 0."""
+    """Poses (T, nq) raised, smoothly in time, where hands, knees, back or whatever else would be below z = 0."""
     qpos = qpos.copy()
     qpos[:, 2] += envelope(np.maximum(-lowest_point(body, qpos), 0), fps)
     return qpos
@@ -124,8 +153,8 @@ def _shorten(turn: np.ndarray, largest: float) -> np.ndarray:
 
 
 def closed_form(figure: Figure, plan: Plan) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Poses (T, nq) by the plan's orientations, which columns (nq,) they give (those of the root and of joints that
-    alone connect two parts), and the plan's orientations, part -> (T, 4), as far as the limits of those joints allow."""
+    """Poses (T, nq) by the plan's orientations; which columns (nq,) they give, those of the root and of joints that
+    alone connect two parts; and the orientations, part -> (T, 4), as far as the limits of those joints allow."""
     model, data = figure.character.model, mujoco.MjData(figure.character.model)
     mujoco.mj_kinematics(model, data)
     turns = dict(plan.turns)
@@ -135,7 +164,7 @@ def closed_form(figure: Figure, plan: Plan) -> tuple[np.ndarray, np.ndarray, dic
         if part not in turns:
             continue
         joints = joints_between(model, figure.bodies[above] + 1, figure.bodies[part] + 1)
-        if len(joints) != 1:
+        if len(joints) != 1 or model.jnt_type[joints[0]] == mujoco.mjtJoint.mjJNT_SLIDE:
             continue
         joint, end = joints[0], data.xquat[figure.bodies[part] + 1]
         carrier = data.xquat[model.jnt_bodyid[joint]]
@@ -156,6 +185,20 @@ def closed_form(figure: Figure, plan: Plan) -> tuple[np.ndarray, np.ndarray, dic
             turn = rotation.from_rotvec((poses[:, at] - model.qpos0[at])[:, None] * axis)
         turns[part] = rotation.multiply(rotation.multiply(base, turn), np.broadcast_to(d, turn.shape))
     return poses, known, turns
+
+
+def limb_columns(figure: Figure) -> dict[str, np.ndarray]:
+    """Last part of each limb -> (nq,) bool, the columns of the joints from the trunk to it."""
+    model, limbs = figure.character.model, {}
+    for side in SIDES:
+        for limb in LIMBS:
+            above, end = ABOVE[f"{side}_{limb[0]}"], f"{side}_{limb[-1]}"
+            joints = joints_between(model, figure.bodies[above] + 1, figure.bodies[end] + 1)
+            ends = np.append(model.jnt_qposadr, model.nq)
+            limbs[end] = np.zeros(model.nq, dtype=bool)
+            for joint in joints:
+                limbs[end][ends[joint] : ends[joint + 1]] = True
+    return limbs
 
 
 def joints_between(model: mujoco.MjModel, above: int, body: int) -> list[int]:

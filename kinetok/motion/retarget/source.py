@@ -201,12 +201,12 @@ def contacts(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Per side (T,) bool: the foot stands; it stands level. A joint stands when it is slow and near the lowest height
     that ankles, or toes, reach. A rig without toes gets a point where they would be."""
-    tips = {side: places.get(f"{side}_toe") for side in SIDES}
     size = np.mean([np.linalg.norm(places[f"{s}_foot"] - places[f"{s}_thigh"], axis=-1).max() for s in SIDES])
+    tips = {}
     for side in SIDES:
-        if tips[side] is None:
-            foot = turned[f"{side}_foot"] @ _rest(places, turned, side, zero)
-            tips[side] = places[f"{side}_foot"] + size * foot @ TIP
+        ankle = places[f"{side}_foot"]
+        guess = ankle + size * (turned[f"{side}_foot"] @ _rest(places, turned, side, zero)) @ TIP
+        tips[side] = places.get(f"{side}_toe", guess)
     down = {}
     for kind, points in (("ankle", {side: places[f"{side}_foot"] for side in SIDES}), ("toe", tips)):
         floor = np.percentile(np.concatenate([points[side][:, 2] for side in SIDES]), 3)

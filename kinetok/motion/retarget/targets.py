@@ -23,8 +23,8 @@ from kinetok.motion.retarget.source import SIDES, Actor, frame, stretches, to_qu
 FADE = 0.2  # s
 LEVELLING = 0.1  # s, the turn into and out of a level foot
 TIPTOE = 0.35  # rad
-STRETCH = 0.998  # of the leg; beyond it the hips come down
-DROP = 0.08  # m, the most they do
+DROP = 0.08  # m, the most that the hips come down where a standing foot is out of reach
+FLOOR = 30  # percentile: heights of standing feet scatter upward, since some are about to leave
 SOFT = 0.004  # m: points of the sole nearer to the lowest than this share the contact
 
 
@@ -60,9 +60,7 @@ def make_plan(actor: Actor, figure: Figure) -> Plan:
     pinned = {side: pin(ankles[side] + up, soles[side], actor.contact[side], actor.fps) for side in SIDES}
     down = _drop(figure, {side: hips[side] + up for side in SIDES}, pinned, actor)
     places, turned = _bodies(frames, figure, middle + up - down[:, None] * [0, 0, 1], pinned)
-    turns = {
-        part: rotation.align(to_quaternions(turned[part] @ figure.frame[part].T)) for part in turned
-    }
+    turns = {part: rotation.align(to_quaternions(turned[part] @ figure.frame[part].T)) for part in turned}
     return Plan(places=places, turns=turns, scaled=scaled, scale=scale, ground=ground)
 
 
@@ -151,13 +149,13 @@ def _soles(feet: np.ndarray, figure: Figure, side: str) -> np.ndarray:
 
 
 def _ground(actor: Actor, ankles: dict[str, np.ndarray], soles: dict[str, np.ndarray]) -> float:
-    """How far to raise the motion so that, in the median, standing feet touch z = 0; where none stands, so that the
-    lowest point of the feet (5th percentile) does."""
+    """How far to raise the motion so that standing feet (percentile FLOOR, of level ones if there are any) touch
+    z = 0; where none stands, so that the lowest point of the feet (5th percentile) does."""
     low = {side: ankles[side][:, 2] + soles[side][..., 2].min(1) for side in SIDES}
     for flags in (actor.level, actor.contact):
         standing = np.concatenate([low[side][flags[side]] for side in SIDES])
         if len(standing):
-            return -float(np.median(standing))
+            return -float(np.percentile(standing, FLOOR))
     return -float(np.percentile(np.minimum(*low.values()), 5))
 
 
@@ -219,7 +217,7 @@ def _drop(figure: Figure, hips: dict[str, np.ndarray], ankles: dict[str, np.ndar
     """Metres (T,) by which the hips come down so that standing feet are within reach, smooth in time."""
     need = np.zeros(len(actor.places["pelvis"]))
     for side in SIDES:
-        reach = STRETCH * (figure.length[f"{side}_thigh"] + figure.length[f"{side}_shin"])
+        reach = figure.length[f"{side}_thigh"] + figure.length[f"{side}_shin"]
         apart = hips[side] - ankles[side]
         room = np.sqrt(np.maximum(reach**2 - (apart[:, :2] ** 2).sum(-1), 0))
         need = np.maximum(need, (apart[:, 2] - room) * actor.contact[side])
