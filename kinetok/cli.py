@@ -98,6 +98,7 @@ def show_json(data: dict, out: Path | None) -> None:
 
 
 PATHS = click.Path(path_type=Path)
+EXPORTS = (".bvh", ".csv", ".npz")  # of programs other than this one
 
 
 @click.group(cls=Chain, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -161,21 +162,15 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
 @click.option("--out", required=True, type=PATHS, help="File to write: .bvh, .csv (robot) or .npz (AMASS-like).")
 @click.option("--name", default=None, help="Which clip of a library; default its only one.")
 def clips_export(source: Path, out: Path, name: str | None) -> None:
-    """Write a clip, recorded or simulated, for Blender (.bvh), a robot (.csv) or SMPL tools (.npz)."""
-    from kinetok.motion.character import Character
-    from kinetok.motion.export import skeleton_motion
-    from kinetok.motion.formats.amass import write_amass
-    from kinetok.motion.formats.bvh import write_bvh
-    from kinetok.motion.formats.robot_csv import write_robot_csv
+    """Write a clip, recorded or simulated, for Blender (.bvh), a robot (.csv) or SMPL tools (.npz).
 
-    check_suffix(out, ".bvh", ".csv", ".npz")
-    clip = one_clip(source, name)
-    if out.suffix == ".csv":
-        write_robot_csv(out, clip)
-    else:
-        motion = skeleton_motion(Character.load(clip.character), clip)
-        (write_bvh if out.suffix == ".bvh" else write_amass)(out, motion)
-    click.echo(f"wrote {out}: {clip.name}, {len(clip.qpos)} frames at {clip.fps:g} fps")
+    \b
+    .bvh   the character's own joints
+    .csv   of the Unitree G1, at 30 fps
+    .npz   SMPL's joints: the character's directions in the lengths of an average body
+    """
+    check_suffix(out, *EXPORTS)
+    write_motion(out, one_clip(source, name))
 
 
 @clips.command("play")
@@ -185,12 +180,15 @@ def clips_export(source: Path, out: Path, name: str | None) -> None:
 @click.option("--seconds", type=float, default=None, help="How much of it; default all, a loop three times.")
 def clips_play(source: Path, out: Path, name: str | None, seconds: float | None) -> None:
     """Render a motion file to a video, as it was recorded and without physics."""
+    from dataclasses import replace
+
     import numpy as np
 
     check_suffix(out, ".mp4")
     clip = one_clip(source, name)
     seconds = seconds or clip.seconds * (3 if clip.loop else 1)
-    write_motion(out, clip.character, clip.at(np.arange(0, seconds, 1 / 30)), 30.0, clip.name, caption=clip.name)
+    qpos = clip.at(np.arange(0, seconds, 1 / 30))
+    write_motion(out, replace(clip, qpos=qpos, fps=30.0, loop=False), caption=clip.name)
 
 
 def one_clip(source: Path, name: str | None):
@@ -258,15 +256,13 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
     Presets: one-clip (minutes), many-clips (hours), from-scratch (end-to-end PPO alone), tiny (tests).
     Example: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
     """
-    from dataclasses import replace
-
     from kinetok import presets
     from kinetok.config import override, pick
     from kinetok.tokenizers.fit import fit
 
-    config = override(pick(presets.FIT, preset, "preset")(), settings)
     if stages:
-        config = replace(config, stages=tuple(stages.split(",")))
+        settings = (*settings, f"stages={stages}")
+    config = override(pick(presets.FIT, preset, "preset")(), settings)
     fit(load_clips(paths), config, out, seed=seed, threads=threads)
 
 
@@ -292,33 +288,55 @@ def tokenize_encode(clip, tokenizer, out, seconds) -> None:
 @tokenize.command("decode")
 @click.argument("tokens", type=PATHS)
 @click.option("--tokenizer", required=True, type=PATHS, help="The tokenizer that wrote the tokens.")
-@click.option("--out", required=True, type=PATHS, help="A clip library (.safetensors) or a video (.mp4).")
+@click.option("--out", required=True, type=PATHS, help=".safetensors (clip library), .mp4, .bvh, .csv or .npz.")
 def tokenize_decode(tokens, tokenizer, out) -> None:
     """Play tokens in simulation from their first state; no reference is involved."""
+    from kinetok.motion.clip import Clip
     from kinetok.tokenizers.codec import TokenStream, decode_tokens
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
-    check_suffix(out, ".safetensors", ".mp4")
+    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
     stream = TokenStream.load(tokens)
     model = MotionTokenizer.from_pretrained(tokenizer)
-    write_motion(out, model.config.character, decode_tokens(model, stream), stream.fps, stream.name)
+    qpos, character = decode_tokens(model, stream), model.config.character
+    write_motion(out, Clip(name=stream.name, character=character, fps=stream.fps, qpos=qpos, source="simulated"))
 
 
-def write_motion(out: Path, character: str, qpos, fps: float, name: str, caption: str = "") -> None:
-    """Write poses (T, nq) as a clip library or as a video, by the file's suffix."""
+def write_motion(out: Path, *clips, caption: str = "") -> None:
+    """Write clips as a library, or one clip as a video or for other programs, by the file's suffix."""
+    from dataclasses import replace
+
     from kinetok.motion.character import Character
-    from kinetok.motion.clip import Clip
+    from kinetok.motion.export import skeleton_motion, smpl_motion
+    from kinetok.motion.formats.amass import write_amass
+    from kinetok.motion.formats.bvh import write_bvh
+    from kinetok.motion.formats.robot_csv import write_robot_csv
     from kinetok.motion.library import ClipLibrary
 
-    check_suffix(out, ".safetensors", ".mp4")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix == ".mp4":
+    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
+    clip, *others = clips
+    character = Character.load(clip.character)
+    if out.suffix == ".safetensors":
+        ClipLibrary.write(out, clips)
+    elif others:
+        raise ValueError(f"--out {out}: {len(clips)} clips; of the files written here only .safetensors holds many")
+    elif out.suffix == ".mp4":
         from kinetok.render.video import render_frames, write_video
 
-        write_video(out, render_frames(Character.load(character), qpos, fps=fps, caption=caption), fps)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_video(out, render_frames(character, clip.qpos, fps=clip.fps, caption=caption), clip.fps)
+    elif out.suffix == ".bvh":
+        write_bvh(out, skeleton_motion(character, clip))
+    elif out.suffix == ".npz":
+        write_amass(out, smpl_motion(character, clip))
     else:
-        ClipLibrary.write(out, [Clip(name=name, character=character, fps=fps, qpos=qpos, source="simulated")])
-    click.echo(f"wrote {out}: {len(qpos)} frames at {fps:g} fps")
+        if abs(clip.fps / 30 - 1) > 1e-3:  # the file carries no rate
+            clip = replace(clip, loop=False).resample(30.0)
+        write_robot_csv(out, clip)
+    told = f"{len(clip.qpos)} frames at {clip.fps:g} fps"
+    if others:
+        told = f"{len(clips)} clips, {sum(c.seconds for c in clips):.1f} s"
+    click.echo(f"wrote {out}: {told}")
 
 
 @main.command()
@@ -349,44 +367,49 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
     )
 
 
-TASK_NAMES = click.Choice(["target", "steering", "path"])
+TASK_NAMES = "target|steering|path"
 
 
 @main.command()
-@click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
-@click.option("--task", default="target", show_default=True, type=TASK_NAMES, help="What to do.")
-@click.option("--adapter", default="cola", show_default=True, type=click.Choice(["cola", "lora", "dora", "full"]))
-@click.option("--method", default="rl", show_default=True, help="rl, sft, or both: sft,rl.")
+@click.option("--prior", default=None, type=PATHS, help="Directory or packaged name.  [default: humanoid-gpt]")
+@click.option("--task", default=None, metavar=TASK_NAMES, help="What to do.  [default: target, or that of --from]")
+@click.option(
+    "--adapter", default=None, metavar="cola|lora|dora|full", help="What bends it.  [default: cola, or that of --from]"
+)
+@click.option("--method", default="rl", show_default=True, help="Of sft,hindsight,rl, in this order.")
 @click.option("--clips", "paths", multiple=True, type=PATHS, help="Example motions for sft: file, library or folder.")
+@click.option("--from", "start", default=None, type=PATHS, help="A fine-tuned skill whose adapter rl begins with.")
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")
-def finetune(prior, task, adapter, method, paths, out, preset, settings, threads, seed) -> None:
+def finetune(prior, task, adapter, method, paths, start, out, preset, settings, threads, seed) -> None:
     """Bend the frozen prior to a task with a small adapter: by reward (rl), by examples (sft), or one after the other.
 
     \b
     Presets: laptop (an hour or two on two cores), paper (GPC's sizes), tiny (tests).
     kinetok finetune --task target --out runs/target
     kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
+    kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
     kinetok sample --adapter runs/target --out target.mp4
     """
     from dataclasses import replace
 
     from kinetok import presets
-    from kinetok.adapters import ADAPTERS
+    from kinetok.adapters.finetune import Skill, reshaped
     from kinetok.adapters.finetune import finetune as bend
     from kinetok.config import override, pick
     from kinetok.gpt.controller import Prior
-    from kinetok.sim.tasks import TASKS
 
     config = pick(presets.FINETUNE, preset, "preset")()
-    if config.task.kind != task:
-        config = replace(config, task=TASKS[task][0]())
-    if config.adapter.kind != adapter:
-        kind = ADAPTERS[adapter][0]
-        shape = {name: getattr(config.adapter, name) for name in ("rank", "alpha") if hasattr(kind, name)}
-        config = replace(config, adapter=kind(**shape))
+    if start is None:
+        base = prior or "humanoid-gpt"
+        model = Prior.from_pretrained(base)
+    else:
+        skill = Skill.from_pretrained(start, prior)
+        model, base = skill.prior, skill.base
+        config = replace(config, task=skill.task, adapter=skill.adapted.config)
+    config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
     config = override(replace(config, methods=tuple(method.split(","))), settings)
-    bend(Prior.from_pretrained(prior), config, out, base=prior, clips=load_clips(paths), seed=seed, threads=threads)
+    bend(model, config, out, base=base, clips=load_clips(paths), start=start, seed=seed, threads=threads)
 
 
 @main.command()
@@ -395,8 +418,10 @@ def finetune(prior, task, adapter, method, paths, out, preset, settings, threads
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
 @click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
-@click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
-@click.option("--temperature", default=1.0, show_default=True, help="Above 1 is bolder, below 1 more usual.")
+@click.option(
+    "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: 0.9, or the skill's own]"
+)
+@click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
 @click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
 @click.option("--push", default=0.0, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds.")
 @option_seed
@@ -404,39 +429,46 @@ def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, p
     """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics).
 
     With --adapter the character does its task, and the video shows what is asked of it; the nucleus and the
-    temperature are then those it was trained with.
+    temperature are those it was trained with, unless you say otherwise.
     """
+    check_suffix(out, ".mp4")
+    drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
     if adapter is not None:
-        return sample_skill(adapter, prior, out, seconds=seconds, count=count, push=push, seed=seed)
+        return sample_skill(adapter, prior, tokenizer, out, drawn, seconds=seconds, count=count, push=push, seed=seed)
     from kinetok.evaluate import measure
     from kinetok.gpt.controller import Prior, roll
     from kinetok.motion.clip import Clip
-    from kinetok.motion.library import ClipLibrary
 
-    check_suffix(out, ".mp4")
     prior = prior or "humanoid-gpt"
+    drawn = {"top_p": 0.9, "temperature": 1.0} | drawn
     model = Prior.from_pretrained(prior, tokenizer)
     character = model.tokenizer.config.character
+    top_p, temperature = drawn["top_p"], drawn["temperature"]
     recording = roll(model, rows=count, seconds=seconds, top_p=top_p, temperature=temperature, push=push, seed=seed)
-    write_motion(out, character, recording.qpos[:, 0], recording.fps, "sample")
     motion = [
         Clip(name=f"sample{i}", character=character, fps=recording.fps, qpos=recording.qpos[:, i], source=str(prior))
         for i in range(count)
     ]
-    ClipLibrary.write(out.with_suffix(".safetensors"), motion)
-    show_json(measure(recording) | {"seed": seed, "top_p": top_p, "prior": str(prior)}, out.with_suffix(".json"))
+    write_motion(out, motion[0])
+    write_motion(out.with_suffix(".safetensors"), *motion)
+    show_json(measure(recording) | {"seed": seed, "prior": str(prior), **drawn}, out.with_suffix(".json"))
 
 
-def sample_skill(adapter, prior, out: Path, *, seconds: float, count: int, push: float, seed: int) -> None:
-    """`sample --adapter`: the first character's video with markers, every character's clip, and the scores."""
+def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, count, push, seed) -> None:
+    """`sample --adapter`: the first character's video with markers, every character's clip, and the scores.
+
+    drawn: settings of how tokens are drawn that replace the skill's own.
+    """
+    from dataclasses import replace
+
     from kinetok.adapters.finetune import Skill
     from kinetok.adapters.rlft import play
+    from kinetok.config import to_dict
     from kinetok.motion.clip import Clip
-    from kinetok.motion.library import ClipLibrary
     from kinetok.render.video import render_frames, write_video
 
-    check_suffix(out, ".mp4")
-    skill = Skill.from_pretrained(adapter, prior)
+    skill = Skill.from_pretrained(adapter, prior, tokenizer)
+    skill = replace(skill, policy=replace(skill.policy, **drawn))
     played = play(
         skill.controller(seed), skill.task, skill.prior,
         episodes=count, seconds=seconds, push=push, seed=seed, record=count,
@@ -452,8 +484,9 @@ def sample_skill(adapter, prior, out: Path, *, seconds: float, count: int, push:
         Clip(name=f"{name}{i}", character=body.name, fps=played.fps, qpos=played.qpos[:, i], source=str(adapter))
         for i in range(count)
     ]
-    ClipLibrary.write(out.with_suffix(".safetensors"), motion)
-    show_json(played.score.measures | {"seed": seed, "adapter": str(adapter)}, out.with_suffix(".json"))
+    write_motion(out.with_suffix(".safetensors"), *motion)
+    told = {"task": name, "push_mps": push, "seed": seed, "adapter": str(adapter)} | to_dict(skill.policy)
+    show_json(played.score.measures | told, out.with_suffix(".json"))
 
 
 @main.group(cls=Chain)
@@ -499,21 +532,23 @@ def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, thread
 
 @evaluate.command("task")
 @click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill; without it, the prior alone.")
-@click.option("--prior", default=None, type=PATHS, help="Its prior, if not at the place it notes.")
-@click.option("--task", default=None, type=TASK_NAMES, help="Another task than the one it was bent to.")
+@click.option(
+    "--prior", default=None, type=PATHS, help="Its prior, if not at the place it notes; or which prior alone."
+)
+@click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
+@click.option("--task", default=None, metavar=TASK_NAMES, help="What to do.  [default: the skill's own; alone: target]")
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=256, show_default=True, help="Characters, each for --seconds.")
 @click.option("--seconds", default=20.0, show_default=True, help="Length of each; a target comes every 6 to 8 s.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
 @option_threads
 @option_seed
-def evaluate_task(adapter, prior, task, out, episodes, seconds, push, threads, seed) -> None:
+def evaluate_task(adapter, prior, tokenizer, task, out, episodes, seconds, push, threads, seed) -> None:
     """How well a skill does its task: success, final distance, errors, return and survival, as the task defines."""
     from kinetok.evaluate import evaluate_task as score
 
-    show_json(
-        score(adapter, prior, task, episodes=episodes, seconds=seconds, push=push, threads=threads, seed=seed), out
-    )
+    told = {"episodes": episodes, "seconds": seconds, "push": push, "threads": threads, "seed": seed}
+    show_json(score(adapter, prior, task, tokenizer=tokenizer, **told), out)
 
 
 @main.command()

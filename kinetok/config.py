@@ -21,6 +21,7 @@ import ast
 import dataclasses
 import difflib
 import json
+import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -71,24 +72,28 @@ def from_dict(cls: type[T], data: Mapping[str, Any], where: str = "config") -> T
     values = {key: _decode(value, hints[key], f"{where}.{key}") for key, value in data.items()}
     try:
         return cls(**values)
-    except ConfigError:
-        raise
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
 
 
 def override(config: T, assignments: Iterable[str]) -> T:
-    """A new config with assignments such as "ppo.epochs=6" or "future=1,2,5" applied in order.
+    """A new config with assignments such as "ppo.epochs=6" or "future=1,2,5"; checked once, when all are made.
 
-    The text is read by the field's type. Assigning another `kind` to a config in a union starts from the
-    defaults of that kind.
+    The text is read by the field's type, and of two values for one key the later counts. Assigning another `kind`
+    to a config in a union starts from the defaults of that kind, wherever it stands among the assignments.
     """
-    for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not equals or not key.strip():
-            raise ConfigError(f"cannot read {assignment!r}; write key=value, for example ppo.epochs=6")
-        config = _assign(config, type(config), key.strip().split("."), text, "config")
-    return config
+    data, pairs = to_dict(config), [_pair(assignment) for assignment in assignments]
+    for keys, text in sorted(pairs, key=lambda pair: len(pair[0]) if pair[0][-1] == "kind" else math.inf):
+        data = _assign(data, type(config), keys, text, "config")
+    return from_dict(type(config), data)
+
+
+def at_least(config: Any, least: float, remedies: Mapping[str, str]) -> None:
+    """Raise ConfigError for the first key of `remedies` whose value in a config is below `least` or not a number."""
+    for key, remedy in remedies.items():
+        value = getattr(config, key)
+        if not value >= least:
+            raise ConfigError(f"{key} must be at least {least}, not {value}; {remedy}")
 
 
 def diff(a: Any, b: Any) -> list[str]:
@@ -215,45 +220,46 @@ def _wrong(value: Any, hint: Any, where: str) -> ConfigError:
     return ConfigError(f"{where}: expected {' | '.join(names)}, not {_said(value)}")
 
 
-def _assign(config: Any, hint: Any, keys: list[str], text: str, where: str) -> Any:
-    """A copy of `config`, annotated `hint`, with the leaf at `keys` read from `text`."""
+def _pair(assignment: str) -> tuple[list[str], str]:
+    """The keys and the text of "ppo.epochs=6"."""
+    key, equals, text = assignment.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"cannot read {assignment!r}; write key=value, for example ppo.epochs=6")
+    return key.strip().split("."), text.strip()
+
+
+def _assign(data: Any, hint: Any, keys: list[str], text: str, where: str) -> Any:
+    """A copy of the JSON `data` of a value annotated `hint`, with the leaf at `keys` read from `text`."""
     key, *rest = keys
-    hints = _hints(config, hint)
-    if hints is None:
-        raise ConfigError(f"{where} is {config!r}, which has no key {key!r}")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{where} is {data!r}, which has no key {key!r}")
+    configs = [member for member in _members(hint) if dataclasses.is_dataclass(member)]
+    hints = _hints(data, hint, configs, where)
     if key not in hints:
         raise ConfigError(f"{where}: unknown key {key!r}; one of: {_listed(hints)}{nearest(key, hints)}")
-    current = config[key] if isinstance(config, dict) else getattr(config, key)
     if rest:
-        return _replace(config, key, _assign(current, hints[key], rest, text, f"{where}.{key}"), where)
-    configs = [member for member in _members(hint) if dataclasses.is_dataclass(member)]
+        return data | {key: _assign(data[key], hints[key], rest, text, f"{where}.{key}")}
     if key == "kind" and len(configs) > 1:
-        return from_dict(_member({"kind": text.strip()}, configs, where), {}, where)
+        chosen = _member({"kind": text}, configs, where)
+        return data if data[key] == text else to_dict(from_dict(chosen, {}, where))
     value = _parse(text, hints[key])
-    if _is_config(current) and value is not None:
-        inside = _listed(f"{key}.{field.name}" for field in dataclasses.fields(current))
-        raise ConfigError(f"{where}.{key} is a {type(current).__name__}; assign one of its keys: {inside}")
-    return _replace(config, key, _decode(value, hints[key], f"{where}.{key}"), where)
+    inner = [member for member in _members(hints[key]) if dataclasses.is_dataclass(member)]
+    if inner and isinstance(data[key], dict) and value is not None:
+        inside = _listed(f"{key}.{name}" for name in data[key])
+        raise ConfigError(
+            f"{where}.{key} is a {_member(data[key], inner, where).__name__}; assign one of its keys: {inside}"
+        )
+    return data | {key: value}
 
 
-def _hints(config: Any, hint: Any) -> dict[str, Any] | None:
-    """How each key of a config, or of a dict annotated `hint`, is annotated; None for anything else."""
-    if isinstance(config, dict):
+def _hints(data: dict[str, Any], hint: Any, configs: list[Any], where: str) -> dict[str, Any]:
+    """How each key of the JSON of a config, or of a dict annotated `hint`, is annotated."""
+    if not configs:
         item = next(get_args(member)[1] for member in _members(hint) if get_origin(member) is dict)
-        return dict.fromkeys(config, item)
-    if not _is_config(config):
-        return None
-    hints = typing.get_type_hints(type(config))
-    return {field.name: hints[field.name] for field in dataclasses.fields(config) if field.init}
-
-
-def _replace(config: Any, key: str, value: Any, where: str) -> Any:
-    if isinstance(config, dict):
-        return config | {key: value}
-    try:
-        return dataclasses.replace(config, **{key: value})
-    except ValueError as error:
-        raise ConfigError(f"{where}.{key}: {error}") from error
+        return dict.fromkeys(data, item)
+    cls = _member(data, configs, where)
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
 def _members(hint: Any) -> tuple[Any, ...]:

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 
 from kinetok import metrics
 from kinetok.adapters.finetune import Skill
-from kinetok.adapters.rlft import play
+from kinetok.adapters.rlft import Controller, play
+from kinetok.config import ConfigError, pick
 from kinetok.gpt.controller import Prior, PriorController, Recording, roll
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
@@ -164,6 +165,7 @@ def evaluate_task(
     prior: Path | str | None = None,
     task: str | None = None,
     *,
+    tokenizer: Path | str | None = None,
     episodes: int = 256,
     seconds: float = 20.0,
     push: float = 0.0,
@@ -172,24 +174,26 @@ def evaluate_task(
 ) -> dict[str, Any]:
     """Scores of a skill, or of a prior alone where adapter is None, on a task (sim.tasks; the skill's own if None).
 
-    A Scorecard's measures: rewards, survival, and what the task defines, such as success_rate and final_distance_m.
+    A Scorecard's measures: rewards, survival, and what the task defines, such as success_rate and final_distance_m,
+    None where it never happened. push: m/s at the root, every two seconds.
     """
+    if task is not None:
+        pick(TASKS, task, "task")
     if adapter is not None:
-        skill = Skill.from_pretrained(adapter, prior)
-        config = skill.task if task in (None, skill.task.kind) else TASKS[task][0]()
-        if config.kind != skill.task.kind:
-            raise ValueError(f"{adapter} was bent to {skill.task.kind!r} and cannot read what {task!r} asks")
-        controller, model = skill.controller(seed), skill.prior
+        skill = Skill.from_pretrained(adapter, prior, tokenizer)
+        config, model, controller = skill.task, skill.prior, skill.controller(seed)
+        if task not in (None, config.kind):
+            raise ConfigError(f"{adapter} was bent to {config.kind!r} and cannot read what {task!r} asks")
     else:
-        model, config = Prior.from_pretrained(prior or "humanoid-gpt"), TASKS[task or "target"][0]()
-        generator = torch.Generator().manual_seed(seed)
-        alone = PriorController(model, generator=generator)
-
-        def controller(obs: Tensor) -> Tensor:
-            return alone.act(obs[:, : model.gpt.config.state_dim])[0]
-
+        model, config = Prior.from_pretrained(prior or "humanoid-gpt", tokenizer), TASKS[task or "target"][0]()
+        controller = _blind(PriorController(model, generator=torch.Generator().manual_seed(seed)))
     played = play(controller, config, model, episodes=episodes, seconds=seconds, push=push, seed=seed, threads=threads)
     return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed}
+
+
+def _blind(alone: PriorController) -> Controller:
+    """A prior that does not see what the task asks."""
+    return lambda obs: alone.act(obs[:, : alone.prior.gpt.config.state_dim])[0]
 
 
 def measure(recording: Recording) -> dict[str, Any]:

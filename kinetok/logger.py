@@ -32,11 +32,14 @@ class Logger:
     """One training run's record.
 
     out: the run's directory, or None for no files. total: steps of the whole run. title: name on the progress
-    line. start: first step to be written (a resumed run's next step). quiet: files only.
+    line. start: first step to be written (a resumed run's next step). stride: how far apart the steps are: 1 counts
+    steps from 0, more counts samples done. quiet: files only.
     """
 
-    def __init__(self, out: Path | None, *, total: int, title: str, start: int = 0, quiet: bool = False):
-        self.total, self.title, self.start, self.quiet = total, title, start, quiet
+    def __init__(
+        self, out: Path | None, *, total: int, title: str, start: int = 0, stride: int = 1, quiet: bool = False
+    ):
+        self.total, self.title, self.start, self.stride, self.quiet = total, title, start, stride, quiet
         self._began = self._told = time.monotonic()
         self._before = 0.0
         self._file: TextIO | None = None
@@ -95,14 +98,14 @@ class Logger:
         self._board = _board(out / "tensorboard", self.start)
 
     def _show(self, step: int, values: dict[str, float], elapsed: float) -> None:
-        done = step + 1 - self.start
-        left = elapsed / max(done, 1) * max(self.total - step - 1, 0)
+        done, count = step + self.stride - self.start, min(step + (self.stride == 1), self.total)
+        left = elapsed / max(done, 1) * max(self.total - count, 0)
         shown = " ".join(f"{key} {value:.4g}" for key, value in list(values.items())[:SHOWN])
         if self._progress:
-            self._progress.update(self._progress.task_ids[0], completed=step + 1, note=f"eta {_clock(left)}  {shown}")
-        elif step + 1 >= self.total or step == self.start or time.monotonic() - self._told >= PLAIN_EVERY:
+            self._progress.update(self._progress.task_ids[0], completed=count, note=f"eta {_clock(left)}  {shown}")
+        elif count >= self.total or step == self.start or time.monotonic() - self._told >= PLAIN_EVERY:
             self._told = time.monotonic()
-            self.message(f"{self.title} {step + 1}/{self.total} eta {_clock(left)}  {shown}")
+            self.message(f"{self.title} {count}/{self.total} eta {_clock(left)}  {shown}")
 
 
 def read_metrics(path: Path | str) -> list[dict[str, Any]]:

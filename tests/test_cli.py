@@ -11,7 +11,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
-from kinetok.checkpoint import load_artifact, save_artifact
+from kinetok.checkpoint import ADAPTER, load_artifact, save_artifact
 from kinetok.cli import main
 from kinetok.motion.formats import read_clips
 from kinetok.tokenizers.codec import TokenStream
@@ -149,8 +149,8 @@ def test_fit_writes_every_stage_and_goes_on_where_it_was(run, clip):
     before = load_artifact(run).hash
     again = kinetok("tokenize", "fit", "--clips", clip, "--out", run, "--preset", "tiny", "--set", "ppo.samples=512")
     assert again.exit_code == 0 and load_artifact(run).hash == before
-    changed = kinetok("tokenize", "fit", "--clips", clip, "--out", run, "--preset", "tiny", "--set", "ppo.samples=1024")
-    assert changed.exit_code == 1 and "stage.samples: 512 -> 1024" in changed.output
+    changed = kinetok("tokenize", "fit", "--clips", clip, "--out", run, "--preset", "tiny", "--set", "ppo.samples=256")
+    assert changed.exit_code == 1 and "stage.samples: 512 -> 256" in changed.output
 
 
 def test_tokens_decode_to_the_motion_they_were_read_from(run, tokens, tmp_path):
@@ -178,10 +178,8 @@ def test_a_prior_is_trained_sampled_and_measured_from_the_files_before_it(run, c
     assert figures["clips"][0]["name"] == "wave"
 
 
-def test_a_sample_is_a_video_a_clip_and_its_figures(run, clip, tmp_path):
+def test_a_sample_is_a_video_a_clip_and_its_figures(prior):
     pytest.importorskip("OpenGL")
-    prior = tmp_path / "prior"
-    assert kinetok("pretrain", "--tokenizer", run, "--clips", clip, "--out", prior, "--preset", "tiny").exit_code == 0
     result = kinetok("sample", "--prior", prior, "--out", "new.mp4", "--seconds", 0.5, "--count", 2)
     if "EGL" in result.output:
         pytest.skip("no EGL on this machine: nothing can be drawn")
@@ -189,6 +187,117 @@ def test_a_sample_is_a_video_a_clip_and_its_figures(run, clip, tmp_path):
     assert Path("new.mp4").stat().st_size > 1000
     assert [len(c.qpos) for c in read_clips(Path("new.safetensors"))] == [15, 15]
     assert json.loads(Path("new.json").read_text())["episodes"] == 2
+
+
+@pytest.fixture(scope="module")
+def prior(run, clip, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("prior") / "wave"
+    assert kinetok("pretrain", "--tokenizer", run, "--clips", clip, "--out", out, "--preset", "tiny").exit_code == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def skill(prior, clip, tmp_path_factory) -> Path:
+    """Examples first, then the task."""
+    out = tmp_path_factory.mktemp("skill") / "target"
+    words = ("--task", "target", "--adapter", "lora", "--method", "sft,rl", "--clips", clip, "--set", "samples=256")
+    result = kinetok("finetune", "--prior", prior, *words, "--out", out, "--preset", "tiny", "--threads", 1)
+    assert result.exit_code == 0, result.output
+    # 2 tokens of 125, width 16, one block: A and B of rank 2 on 64, 32, 80 and 80 sides, the token's net of 8.
+    first = result.output.splitlines()[0]
+    assert first.startswith(f"lora adapter of {2 * 256 + 3 * 8 + 9 * 16:,} parameters, ") and "stay frozen" in first
+    assert "best evaluation: " in result.output and str(out) in result.output
+    return out
+
+
+def test_a_skill_is_measured_and_taken_further(skill, prior, tmp_path):
+    words = ("evaluate", "task", "--adapter", skill, "--episodes", 3, "--seconds", 1, "--push", 0.5, "--seed", 2)
+    result = kinetok(*words, "--task", "target", "--json", "task.json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(Path("task.json").read_text())
+    assert {"success_rate", "final_distance_m", "return", "survival_rate", "episodes", "seed"} <= told.keys()
+    assert (told["episodes"], told["seed"], told["push_mps"], told["task"]) == (3, 2, 0.5, "target")
+    assert json.loads(kinetok(*words, "--prior", prior).output) == told
+    alone = kinetok("evaluate", "task", "--prior", prior, "--task", "path", "--episodes", 2, "--seconds", 1)
+    assert alone.exit_code == 0 and "path_distance_m" in json.loads(alone.output)
+
+    words = ("finetune", "--from", skill, "--set", "task.distance=2,3", "--set", "samples=256", "--preset", "tiny")
+    result = kinetok(*words, "--out", "further")
+    assert result.exit_code == 0, result.output
+    further = load_artifact("further", "adapter", ADAPTER)
+    assert further.parents["skill"] == load_artifact(skill, "adapter", ADAPTER).hash
+    assert further.config["adapted"]["adapter"]["kind"] == "lora"
+    assert further.config["skill"]["task"]["distance"] == [2.0, 3.0]
+
+
+def test_a_skill_is_shown_with_what_is_asked_of_it(skill):
+    pytest.importorskip("OpenGL")
+    words = ("--seconds", 0.5, "--count", 2, "--top-p", 0.5)
+    result = kinetok("sample", "--adapter", skill, "--out", "deep/target.mp4", *words)
+    if "EGL" in result.output:
+        pytest.skip("no EGL on this machine: nothing can be drawn")
+    assert result.exit_code == 0, result.output
+    assert Path("deep/target.mp4").stat().st_size > 1000
+    assert [len(c.qpos) for c in read_clips(Path("deep/target.safetensors"))] == [15, 15]
+    told = json.loads(Path("deep/target.json").read_text())
+    assert told["episodes"] == 2 and told["top_p"] == 0.5 and told["temperature"] == 1.0 and told["task"] == "target"
+
+
+TUNE = ("finetune", "--preset", "tiny", "--prior")
+UNFIT = {  # from the prior, the clip, and a skill
+    "task": (
+        lambda g, c, s: (*TUNE, g, "--task", "targt"),
+        "unknown task 'targt'; one of: target, steering, path; did",
+    ),
+    "adapter": (lambda g, c, s: (*TUNE, g, "--adapter", "colla"), "did you mean 'cola'?"),
+    "method": (lambda g, c, s: (*TUNE, g, "--method", "rll"), "unknown method 'rll'; did you mean 'rl'?"),
+    "target module": (
+        lambda g, c, s: (*TUNE, g, "--set", "adapter.targets=qkw"),
+        "no linear layer is called 'qkw'; one of ",
+    ),
+    "setting": (
+        lambda g, c, s: (*TUNE, g, "--adapter", "lora", "--set", "adapter.rnk=3"),
+        "config.adapter: unknown key 'rnk'; one of: kind, rank, alpha, dropout, targets, hidden; did you mean 'rank'?",
+    ),
+    "setting of another adapter": (
+        lambda g, c, s: (*TUNE, g, "--adapter", "lora", "--set", "adapter.task_token=false"),
+        "config.adapter: unknown key 'task_token'",
+    ),
+    "task setting": (lambda g, c, s: (*TUNE, g, "--set", "task.nera=1"), "did you mean 'near'?"),
+    "rank": (lambda g, c, s: (*TUNE, g, "--set", "adapter.rank=0"), "CoLA needs rank >= 1, not 0"),
+    "nucleus": (lambda g, c, s: (*TUNE, g, "--set", "policy.top_p=2"), "top_p must lie in (0, 1], not 2.0"),
+    "preset": (lambda g, c, s: ("finetune", "--preset", "latop", "--prior", g), "did you mean 'laptop'?"),
+    "no clips": (lambda g, c, s: (*TUNE, g, "--method", "sft"), "needs example clips: --clips PATH"),
+    "clips for rl": (lambda g, c, s: (*TUNE, g, "--clips", c), "add --method sft"),
+    "no prior": (lambda g, c, s: (*TUNE, "humanoid-gtp"), "did you mean 'humanoid-gpt'?"),
+    "skill as prior": (lambda g, c, s: (*TUNE, s), "has no config.json"),
+    "another shape than from": (
+        lambda g, c, s: (*TUNE, g, "--from", s, "--adapter", "cola"),
+        "holds an adapter of another shape: adapter.kind: lora -> cola",
+    ),
+    "another prior than from": (
+        lambda g, c, s: (*TUNE, "humanoid-gpt", "--from", s),
+        "but humanoid-gpt is ",
+    ),
+}
+
+
+@pytest.mark.parametrize(("args", "message"), UNFIT.values(), ids=UNFIT)
+def test_what_does_not_fit_is_one_line_and_writes_nothing(args, message, tmp_path, prior, clip, skill):
+    result = kinetok(*args(prior, clip, skill), "--out", tmp_path / "new" / "out")
+    assert result.exit_code == 1
+    assert result.output.startswith("Error: ") and result.output.count("\n") == 1
+    assert message in result.output
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_skill_cannot_do_another_task(skill, prior):
+    result = kinetok("evaluate", "task", "--adapter", skill, "--task", "steering")
+    assert result.exit_code == 1 and "was bent to 'target' and cannot read what 'steering' asks" in result.output
+    result = kinetok("evaluate", "task", "--prior", prior, "--task", "stering")
+    assert result.exit_code == 1 and "did you mean 'steering'?" in result.output
+    result = kinetok("sample", "--adapter", prior, "--out", "x.mp4")
+    assert result.exit_code == 1 and "has no adapter_config.json" in result.output
 
 
 def gpt(path: Path) -> Path:
@@ -290,7 +399,7 @@ def test_a_mistake_is_one_line_and_writes_nothing(args, message, tmp_path, clip,
     [
         (("clips", "import", "CLIP"), ".safetensors"),
         (("tokenize", "encode", "CLIP", "--tokenizer", "RUN"), ".safetensors"),
-        (("tokenize", "decode", "TOKENS", "--tokenizer", "RUN"), ".safetensors or .mp4"),
+        (("tokenize", "decode", "TOKENS", "--tokenizer", "RUN"), ".safetensors or .mp4 or .bvh or .csv or .npz"),
         (("sample",), ".mp4"),
     ],
 )

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from kinetok.config import ConfigError, diff, from_dict, nearest, override, pick, to_dict
+from kinetok.config import ConfigError, at_least, diff, from_dict, nearest, override, pick, to_dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,13 +144,49 @@ def test_overrides_apply_in_order_and_leave_the_original():
     assert to_dict(ROOT) == before
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """Of which a check concerns two fields."""
+
+    low: int = 0
+    high: int = 1
+    quantizer: FSQ | VQ = FSQ()
+
+    def __post_init__(self):
+        if self.low >= self.high:
+            raise ConfigError(f"low {self.low} must be below high {self.high}")
+
+
+@pytest.mark.parametrize("order", [["low=5", "high=6"], ["high=6", "low=5"]])
+def test_settings_are_checked_together_in_any_order(order):
+    assert override(Pair(), order) == Pair(low=5, high=6)
+    with pytest.raises(ConfigError, match="config: low 5 must be below high 1"):
+        override(Pair(), ["low=5"])
+
+
+def test_a_kind_counts_before_its_settings_and_the_same_kind_changes_nothing():
+    assert override(ROOT, ["quantizer.codes=3", "quantizer.kind=vq"]).quantizer == VQ(codes=3)
+    custom = override(ROOT, ["quantizer.levels=5"])
+    assert override(custom, ["quantizer.kind=fsq"]) == custom
+    with pytest.raises(ConfigError, match=r"config\.quantizer: unknown key 'levels'; one of: kind, codes"):
+        override(ROOT, ["quantizer.levels=5", "quantizer.kind=vq"])
+
+
+def test_at_least_names_key_value_and_remedy():
+    at_least(PPO(epochs=1), 1, {"epochs": "one is enough"})
+    with pytest.raises(ConfigError, match="epochs must be at least 1, not 0; one is enough"):
+        at_least(PPO(epochs=0), 1, {"epochs": "one is enough"})
+    with pytest.raises(ConfigError, match=r"clip must be at least 0\.1, not nan; more"):
+        at_least(PPO(clip=float("nan")), 0.1, {"epochs": "more", "clip": "more"})
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
         ("ppo.epochs", "cannot read 'ppo.epochs'; write key=value, for example ppo.epochs=6"),
         ("ppo.epoch=6", "config.ppo: unknown key 'epoch'; one of: epochs, clip; did you mean 'epochs'?"),
         ("ppo.epochs=six", "config.ppo.epochs: expected int, not 'six' (str)"),
-        ("ppo.clip=-1", "config.ppo.clip: clip must be positive, not -1.0"),
+        ("ppo.clip=-1", "config.ppo: clip must be positive, not -1.0"),
         ("ppo=6", "config.ppo is a PPO; assign one of its keys: ppo.epochs, ppo.clip"),
         ("prior.epochs=6", "config.prior is None, which has no key 'epochs'"),
         ("name.first=a", "config.name is 'run', which has no key 'first'"),

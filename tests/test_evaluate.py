@@ -7,16 +7,24 @@ import numpy as np
 import pytest
 from made import make_clips, make_prior, make_tokenizer
 
+from kinetok.adapters import LoRAConfig
+from kinetok.adapters.adapted import Adapted
+from kinetok.adapters.finetune import Skill
+from kinetok.adapters.rlft import TokenPolicyConfig
+from kinetok.checkpoint import CheckpointError
+from kinetok.config import ConfigError
 from kinetok.evaluate import (
     evaluate_prior,
+    evaluate_task,
     evaluate_tracking,
     measure,
     standing_foot_height,
     starting_poses,
     survived,
 )
-from kinetok.gpt.controller import Recording, roll
+from kinetok.gpt.controller import Prior, Recording, roll
 from kinetok.presets import FIT
+from kinetok.sim.tasks import SteeringConfig
 from kinetok.tokenizers.fit import new_tokenizer
 
 
@@ -120,3 +128,54 @@ def test_a_teacher_has_no_tokens_to_count(table):
     config = replace(FIT["tiny"]().teacher_tokenizer, future=(1, 2))
     told = evaluate_tracking(new_tokenizer(config, table, 0), make_clips(table), episodes=1, threads=1)
     assert told["utilisation"] is None and told["perplexity"] is None
+
+
+@pytest.fixture(scope="module")
+def steering(tmp_path_factory, table):
+    """The directories of a skill that has learned nothing, and of its prior: it plays as the prior does."""
+    home = tmp_path_factory.mktemp("home")
+    prior = make_prior(home, table)
+    adapted = Adapted(prior.gpt, LoRAConfig(rank=1, alpha=1.0, hidden=4), cond_dim=4)
+    task = SteeringConfig(speed=(0.7, 0.9))
+    Skill(
+        adapted=adapted, prior=prior, base=str(home / "prior"), task=task, policy=TokenPolicyConfig(top_p=0.9)
+    ).save_pretrained(home / "skill")
+    return home / "skill", home / "prior"
+
+
+def test_a_task_is_measured_the_same_at_any_thread_count_and_by_its_seed(steering):
+    skill, _ = steering
+    one, two, other = (
+        evaluate_task(skill, episodes=3, seconds=1.0, seed=seed, threads=threads, push=0.5)
+        for seed, threads in ((1, 1), (1, 2), (2, 1))
+    )
+    assert one == two != other
+    assert {"return", "survival_rate", "velocity_error_mps", "heading_error_rad"} <= one.keys()
+    assert (one["task"], one["seed"], one["episodes"], one["push_mps"]) == ("steering", 1, 3, 0.5)
+    assert "success_rate" not in one  # steering defines none
+    json.dumps(one, allow_nan=False)
+
+
+def test_the_prior_alone_does_what_a_skill_does_that_has_learned_nothing(steering):
+    skill, prior = steering
+    options = {"episodes": 2, "seconds": 0.5, "seed": 3, "threads": 1}
+    bent = evaluate_task(skill, prior, "steering", **options)
+    alone = evaluate_task(None, prior, "steering", **options)
+    assert bent["survival_rate"] == alone["survival_rate"]
+    assert bent["velocity_error_mps"] != alone["velocity_error_mps"]  # the skill's own speeds, the task's usual ones
+    target = evaluate_task(None, prior, **options)
+    assert target["task"] == "target" and target["success_rate"] is None and target["final_distance_m"] is None
+
+
+def test_what_cannot_be_evaluated(steering, tmp_path):
+    skill, prior = steering
+    with pytest.raises(ConfigError, match="was bent to 'steering' and cannot read what 'path' asks"):
+        evaluate_task(skill, task="path")
+    with pytest.raises(ConfigError, match="unknown task 'walk'; one of: target, steering, path"):
+        evaluate_task(None, prior, "walk")
+    with pytest.raises(CheckpointError, match=r"prior has no adapter_config\.json"):
+        evaluate_task(prior)
+    with pytest.raises(ValueError, match="0 episodes of 1 s hold no control step"):
+        evaluate_task(skill, episodes=0, seconds=1.0)
+    with pytest.raises(CheckpointError, match="there is no directory"):
+        Prior.from_pretrained(tmp_path / "no")

@@ -75,3 +75,37 @@ def test_settings_reach_the_leaves():
 def test_an_unknown_preset_names_the_nearest():
     with pytest.raises(ConfigError, match=r"unknown preset 'one_clip'; one of: one-clip.*did you mean 'one-clip'"):
         pick(presets.FIT, "one_clip", "preset")
+
+
+@pytest.mark.parametrize("build", presets.FINETUNE.values(), ids=presets.FINETUNE)
+def test_a_skill_draws_as_the_paper_does_and_is_judged_while_it_trains(build):
+    config = build()
+    assert (config.policy.top_p, config.policy.temperature) == (0.9, 1.0)  # GPC table 12
+    assert config.eval_every <= config.samples and config.eval_seconds * 30 >= 1
+    assert config.rows * config.ppo.horizon >= config.ppo.minibatch
+    assert config.critic_warmup * config.rows * config.ppo.horizon < config.samples
+
+
+def test_the_papers_skill_is_the_papers():
+    adapter = presets.FINETUNE["paper"]().adapter
+    assert (adapter.kind, adapter.rank, adapter.alpha) == ("cola", 64, 128.0)
+
+
+def test_settings_of_a_skill_reach_the_members_of_a_union():
+    config = override(
+        presets.FINETUNE["laptop"](),
+        ["adapter.kind=dora", "adapter.rank=4", "adapter.targets=qkv,proj", "task.kind=path", "task.speed=0.5,1"],
+    )
+    assert (config.adapter.kind, config.adapter.rank, config.adapter.targets) == ("dora", 4, ("qkv", "proj"))
+    assert config.task.kind == "path" and config.task.speed == (0.5, 1.0)
+    for assignment, message in (
+        ("adapter.kind=cora", "did you mean '(cola|dora|lora)'"),
+        ("adapter.rnk=3", "did you mean 'rank'"),
+        ("task.kind=stering", "did you mean 'steering'"),
+        ("policy.entrpy=1", "did you mean 'entropy'"),
+        ("policy.top_p=0", "top_p must lie in"),
+        ("sft.iterations=0", "iterations must be at least 1"),
+        ("methods=rl,sft", "sft before rl"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            override(config, [assignment])

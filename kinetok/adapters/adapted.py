@@ -184,12 +184,18 @@ class Adapted(nn.Module):
         return merged(self.gpt)
 
     def save_pretrained(
-        self, path: Path | str, *, base: str, card: str | None = None, skill: dict | None = None
+        self,
+        path: Path | str,
+        *,
+        base: str,
+        card: str | None = None,
+        skill: dict | None = None,
+        parents: dict[str, str] | None = None,
     ) -> None:
         """Write the adapter directory: adapter_config.json, adapter_model.safetensors, README.md.
 
         base: name or place of the prior that was bent, noted for readers; card: the README, None for a short one;
-        skill: what finetune.Skill says of the task, JSON.
+        skill: what finetune.Skill says of the task, JSON; parents: role -> hash of what else it was made from.
         """
         identity, config = fingerprint(self.base), AdaptedConfig(adapter=self.config, cond_dim=self.cond_dim)
         trainable, frozen, share = parameters_of(self)
@@ -203,7 +209,7 @@ class Adapted(nn.Module):
             config={"adapted": to_dict(config), "skill": skill},
             tensors=self.adapter_state(),
             card=card,
-            parents={"gpt": identity},
+            parents={"gpt": identity, **(parents or {})},
             files=ADAPTER,
             extra=self._for_peft(base),
         )

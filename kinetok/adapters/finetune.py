@@ -4,29 +4,35 @@
     skill = Skill.from_pretrained("runs/target")
     played = play(skill.controller(seed=0), skill.task, skill.prior, episodes=256)
 
-Two methods, each of which may be left out:
+Three methods, each of which may be left out:
 
-1. sft   cross-entropy on the tokens of example clips, tracked by the frozen tokenizer: a style      out/sft
-2. rl    PPO over the tokens of a control step, within the frozen prior's nucleus: the task           out
+1. sft        cross-entropy on the tokens of example clips, tracked by the frozen tokenizer: a style    out/sft
+2. hindsight  cross-entropy on own tokens, given what came of them: the task, without a reward    out/hindsight
+3. rl         PPO over the tokens of a control step, within the frozen prior's nucleus: the task            out
+
+The last one asked for writes to `out` itself. A method begins with the best of the one before it; rl may begin
+with the adapter of another skill instead.
 
 A `Skill` is what comes out: an adapter, the prior it bends and the task it was bent to. Its artifact holds the
 adapter alone; the prior stays an artifact of its own, found by the place noted and refused unless it is the one.
+What it began with is noted too, as its parent "skill".
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from kinetok.adapters import AdapterConfig, CoLAConfig
-from kinetok.adapters.adapted import Adapted, fingerprint, parameters_of
+from kinetok.adapters import ADAPTERS, AdapterConfig, CoLAConfig
+from kinetok.adapters.adapted import Adapted, AdaptedConfig, fingerprint, parameters_of
+from kinetok.adapters.hindsight import HindsightConfig, hindsight
 from kinetok.adapters.rlft import Controller, TaskScore, TokenPolicy, TokenPolicyConfig, play, task_of
 from kinetok.adapters.sft import SFTConfig, supervise
-from kinetok.checkpoint import ADAPTER, CheckpointError, load_artifact, locate
-from kinetok.config import ConfigError, from_dict, nearest, pick, to_dict
+from kinetok.checkpoint import ADAPTER, CheckpointError, load_artifact, locate, refuse_foreign
+from kinetok.config import ConfigError, diff, from_dict, nearest, pick, to_dict
 from kinetok.gpt.controller import Prior, noted_path
+from kinetok.gpt.pretrain import THREADS
 from kinetok.motion.clip import Clip
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
@@ -36,20 +42,22 @@ from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks import TASKS, GoalConfig, TargetConfig
 from kinetok.tokenizers.train import in_scene
 
-METHODS = ("sft", "rl")
+METHODS = ("sft", "hindsight", "rl")
+JUDGE = 1_000_000  # added to the seed of a run: the episodes that choose its best are asked by no `evaluate task`
 
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneConfig:
-    """task; adapter: its kind and shape; methods: of sft, rl, in this order; policy: how tokens are drawn; samples:
-    control steps of rl, in `rows` worlds; eval_every: samples between evaluations of `eval_episodes` episodes of
-    eval_seconds; critic: widths of the value network on state and task; critic_warmup: first iterations that leave the
-    adapter alone."""
+    """task; adapter: its kind and shape; methods: of sft, hindsight, rl, in this order; sft; hindsight; policy: how
+    tokens are drawn; samples: control steps of rl, in `rows` worlds; eval_every: samples between evaluations of
+    `eval_episodes` episodes of eval_seconds; critic: widths of the value network on state and task; critic_warmup:
+    first iterations that leave the adapter alone; env: the worlds of rl, in the tokenizer's scene; ppo."""
 
     task: GoalConfig = TargetConfig()
     adapter: AdapterConfig = CoLAConfig(rank=16, alpha=32.0)
     methods: tuple[str, ...] = ("rl",)
     sft: SFTConfig = SFTConfig()
+    hindsight: HindsightConfig = HindsightConfig()
     policy: TokenPolicyConfig = TokenPolicyConfig()
     samples: int = 2_000_000
     rows: int = 512
@@ -70,51 +78,78 @@ class FinetuneConfig:
             if method not in METHODS:
                 raise ConfigError(f"unknown method {method!r}{nearest(method, METHODS)}; methods: {', '.join(METHODS)}")
         if not self.methods or list(self.methods) != sorted(set(self.methods), key=METHODS.index):
-            raise ConfigError(f"methods {self.methods}: name each once, sft before rl")
+            raise ConfigError(f"methods {', '.join(self.methods) or '(none)'}: name each once, sft before rl")
+        for name in ("samples", "rows", "eval_every", "eval_episodes"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.eval_seconds < 0.1:
+            raise ConfigError(f"eval_seconds must be at least 0.1, not {self.eval_seconds}")
+
+
+def reshaped(config: FinetuneConfig, *, task: str, adapter: str) -> FinetuneConfig:
+    """The same for the task and the adapter of these kinds; another adapter takes over what it has in common, such as
+    rank and alpha."""
+    if config.task.kind != task:
+        config = replace(config, task=pick(TASKS, task, "task")[0]())
+    if config.adapter.kind != adapter:
+        kind, _ = pick(ADAPTERS, adapter, "adapter")
+        names = {f.name for f in fields(kind)} & {f.name for f in fields(config.adapter)} - {"kind"}
+        config = replace(config, adapter=kind(**{name: getattr(config.adapter, name) for name in names}))
+    return config
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skill:
-    """adapted: the bent prior, in eval mode; prior; task: what it was bent to; policy: how its tokens are drawn."""
+    """adapted: the bent prior, in eval mode; prior; base: where that lies, its directory or packaged name; task: what
+    it was bent to; policy: how its tokens are drawn."""
 
     adapted: Adapted
     prior: Prior
+    base: str
     task: GoalConfig
     policy: TokenPolicyConfig
 
     def controller(self, seed: int | None = 0) -> Controller:
         """Observations of the task to PD targets; seed None takes the most probable tokens."""
         generator = None if seed is None else torch.Generator().manual_seed(seed)
-        layout = task_of(self.task, self.prior, 1).layout
-        return TokenPolicy(self.adapted, self.prior.tokenizer, layout, self.policy).controller(generator)
+        return TokenPolicy(self.adapted, self.prior.tokenizer, self.policy).controller(generator)
 
-    def save_pretrained(self, path: Path | str, *, base: Path | str, card: str | None = None) -> None:
-        """Write the adapter's directory. base: the prior's directory or packaged name."""
-        noted = noted_path(base, path)
+    def save_pretrained(self, path: Path | str, card: str | None = None, parents: dict[str, str] | None = None) -> None:
+        """Write the adapter's directory. parents: role -> hash of what it was made from besides the prior."""
+        noted = noted_path(self.base, path)
         skill = {"prior": noted, "task": to_dict(self.task), "policy": to_dict(self.policy)}
-        self.adapted.save_pretrained(path, base=noted, card=card, skill=skill)
+        self.adapted.save_pretrained(path, base=noted, card=card, skill=skill, parents=parents)
 
     @staticmethod
-    def from_pretrained(path: Path | str, prior: Prior | Path | str | None = None) -> "Skill":
+    def from_pretrained(
+        path: Path | str, prior: Prior | Path | str | None = None, tokenizer: Path | str | None = None
+    ) -> "Skill":
         """Load an adapter by directory or packaged name, with its prior: `prior`, itself or its directory, if given,
-        else the one at the noted place."""
+        else the one at the noted place. tokenizer: directory of the prior's, if it is not where the prior says."""
         artifact = load_artifact(path, "adapter", ADAPTER)
-        skill = artifact.config["skill"]
-        if skill is None:
+        noted = artifact.config["skill"]
+        if noted is None:
             raise CheckpointError(f"{artifact.path} is an adapter that says nothing of a task; it cannot be played")
+        base = "the prior given"
         if not isinstance(prior, Prior):
-            wanted = skill["prior"] if prior is None else str(prior)
-            places = [artifact.path / wanted, locate(wanted)] if prior is None else [locate(wanted)]
-            found = next((place for place in places if place.is_dir()), None)
-            if found is None:
-                raise CheckpointError(f"{artifact.path}: its prior is not at {wanted!r}; give its place, --prior DIR")
-            prior = Prior.from_pretrained(found)
+            base = _find(artifact.path, noted["prior"]) if prior is None else str(prior)
+            prior = Prior.from_pretrained(base, tokenizer)
         return Skill(
-            adapted=Adapted.from_pretrained(artifact.path, prior.gpt, base=skill["prior"]),
+            adapted=Adapted.from_pretrained(artifact.path, prior.gpt, base=base),
             prior=prior,
-            task=from_dict(pick(TASKS, skill["task"]["kind"], "task")[0], skill["task"]),
-            policy=from_dict(TokenPolicyConfig, skill["policy"]),
+            base=base,
+            task=from_dict(pick(TASKS, noted["task"]["kind"], "task")[0], noted["task"]),
+            policy=from_dict(TokenPolicyConfig, noted["policy"]),
         )
+
+
+def _find(adapter: Path, noted: str) -> str:
+    """The prior that the adapter in this directory notes: its directory, or its packaged name."""
+    if (adapter / noted).is_dir():
+        return str(adapter / noted)
+    if not locate(noted).is_dir():
+        raise CheckpointError(f"{adapter}: its prior is not at {noted!r}; give its place, --prior DIR")
+    return noted
 
 
 def finetune(
@@ -124,128 +159,241 @@ def finetune(
     *,
     base: Path | str,
     clips: Sequence[Clip] = (),
+    start: Path | str | None = None,
     seed: int = 0,
     threads: int = 0,
     quiet: bool = False,
 ) -> Skill:
-    """Run the methods that are not finished yet and write the best skill to `out`.
+    """Run the methods that are not finished yet, write the best skill to `out` and return it.
 
-    base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft.
+    base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft. start: the adapter, of
+    the same shape and prior, that rl begins with. threads: of physics and torch; 0 is every core for physics and two
+    for torch.
     """
-    with torch_threads(threads or torch.get_num_threads()):
-        return _finetune(prior, config, out, base=base, clips=clips, seed=seed, threads=threads, quiet=quiet)
+    with torch_threads(threads or THREADS):
+        return _finetune(prior, config, out, base, clips, start, seed=seed, threads=threads, quiet=quiet)
 
 
-def _finetune(prior, config: FinetuneConfig, out: Path, *, base, clips, seed: int, threads: int, quiet: bool) -> Skill:
+def _finetune(
+    prior: Prior,
+    config: FinetuneConfig,
+    out: Path,
+    base: Path | str,
+    clips: Sequence[Clip],
+    start: Path | str | None,
+    *,
+    seed: int,
+    threads: int,
+    quiet: bool,
+) -> Skill:
+    _check(prior, config, clips, start, out)
+    torch.manual_seed(seed)
+    adapted = _adapted(prior, config, base, start)
+    skill = Skill(adapted=adapted, prior=prior, base=str(base), task=config.task, policy=config.policy)
+    places = {method: out / method for method in config.methods[:-1]} | {config.methods[-1]: out}
+    for place in places.values():
+        refuse_foreign(place, ADAPTER)
+    out.mkdir(parents=True, exist_ok=True)
+    if not quiet:
+        count, frozen, share = parameters_of(adapted)
+        said = f"{count:,} parameters, {share:.2%} of the {frozen:,} that stay frozen"
+        print(f"{config.adapter.kind} adapter of {said}", flush=True)
+    identity = {
+        "prior": fingerprint(prior.gpt),
+        "tokenizer": prior.tokenizer.hash,
+        "start": load_artifact(start, "adapter", ADAPTER).hash if start else "",
+        "clips": [clip.name for clip in clips],
+        "seed": seed,
+    }
+    told = {"seed": seed, "threads": threads, "quiet": quiet}
+    if "sft" in config.methods:
+        _imitate(skill, config, places["sft"], clips, identity, **told)
+        identity["start"] = _take(skill, places["sft"])
+    if "hindsight" in config.methods:
+        _look_back(skill, config, places["hindsight"], identity, **told)
+        identity["start"] = _take(skill, places["hindsight"])
+    if "rl" in config.methods:
+        _reinforce(skill, config, out, identity, **told)
+        _take(skill, out)
+    return skill
+
+
+def _check(prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: Path | str | None, out: Path) -> None:
+    """Refuse what cannot be done, before any of it is."""
     if "sft" in config.methods and not clips:
         raise ConfigError("supervised fine-tuning needs example clips: --clips PATH")
     if clips and "sft" not in config.methods:
         raise ConfigError("the clips are used by supervised fine-tuning alone; add --method sft, or both: sft,rl")
-    task = task_of(config.task, prior, config.rows)
-    env = Env(in_scene(config.env, prior.tokenizer.config.scene), task, rows=config.rows, threads=threads, seed=seed)
-    torch.manual_seed(seed)
-    width = task.layout["task"].stop - task.layout["task"].start
-    adapted = Adapted(prior.gpt, config.adapter, cond_dim=width)
-    skill = Skill(adapted=adapted, prior=prior, task=config.task, policy=config.policy)
-    policy = TokenPolicy(adapted, prior.tokenizer, task.layout, config.policy)
-    asked = torch.from_numpy(env.reset()[:, task.layout["task"]])
-    adapted.observe(asked)
-    if "sft" in config.methods:
-        where = out / "sft" if "rl" in config.methods else out
+    body = prior.tokenizer.config.character
+    for clip in clips:
+        if clip.character != body:
+            raise ConfigError(
+                f"clip {clip.name!r} is of {clip.character!r}, the prior moves {body!r}; retarget it first"
+            )
+    if start is not None and config.methods != ("rl",):
+        raise ConfigError("another skill's adapter is where reinforcement learning begins: --from needs --method rl")
+    if start is not None and out.exists() and out.resolve() == locate(start, ADAPTER).resolve():
+        raise ConfigError(f"--from and --out are the same folder, {out}; choose another --out")
+    in_scene(config.env, prior.tokenizer.config.scene)
 
-        def save(metrics: dict[str, float]) -> None:
-            skill.save_pretrained(where, base=base, card=skill_card(skill, config, seed, clips, metrics))
 
-        supervise(
-            adapted,
-            prior.tokenizer,
-            clips,
-            asked,
-            config.sft,
-            where,
-            save=save,
-            seed=seed,
-            threads=threads,
-            quiet=quiet,
+def _adapted(prior: Prior, config: FinetuneConfig, base: Path | str, start: Path | str | None) -> Adapted:
+    """The prior with a fresh adapter, or with that of the skill at `start`."""
+    columns = task_of(config.task, prior, 1).layout["task"]
+    shape = AdaptedConfig(adapter=config.adapter, cond_dim=columns.stop - columns.start)
+    if start is None:
+        return Adapted(prior.gpt, shape.adapter, shape.cond_dim)
+    adapted = Adapted.from_pretrained(start, prior.gpt, base=base)
+    changed = diff(AdaptedConfig(adapter=adapted.config, cond_dim=adapted.cond_dim), shape)
+    if changed:
+        raise ConfigError(
+            f"{start} holds an adapter of another shape: {'; '.join(changed)}. "
+            "Ask for the same adapter, and for a task whose observation is as wide"
         )
-    if "rl" in config.methods:
-        _reinforce(skill, policy, env, config, out, base=base, clips=clips, seed=seed, threads=threads, quiet=quiet)
-    return skill
+    return adapted
+
+
+def _take(skill: Skill, place: Path) -> str:
+    """Give `skill` the adapter that was saved at `place`; its hash."""
+    artifact = load_artifact(place, "adapter", ADAPTER)
+    skill.adapted.load_adapter_state_(artifact.tensors)
+    return artifact.hash
+
+
+def _imitate(
+    skill: Skill,
+    config: FinetuneConfig,
+    out: Path,
+    clips: Sequence[Clip],
+    identity: dict,
+    *,
+    seed: int,
+    threads: int,
+    quiet: bool,
+) -> None:
+    def save(metrics: dict[str, float]) -> None:
+        names = ", ".join(clip.name for clip in clips)
+        story = f"supervised, {config.sft.iterations} iterations on what the tokenizer does of the clips {names}"
+        found = f"Held-out worlds, iteration {metrics['iteration']:.0f}, which was the best"
+        measures = {name: value for name, value in metrics.items() if name != "iteration"}
+        skill.save_pretrained(out, skill_card(skill, story, seed, found, measures))
+
+    own = {"task": to_dict(config.task), "policy": to_dict(config.policy), "adapter": to_dict(config.adapter)}
+    supervise(
+        skill.adapted,
+        skill.prior.tokenizer,
+        clips,
+        config.sft,
+        out,
+        identity=identity | own,
+        save=save,
+        seed=seed,
+        threads=threads,
+        quiet=quiet,
+    )
+
+
+def _look_back(
+    skill: Skill, config: FinetuneConfig, out: Path, identity: dict, *, seed: int, threads: int, quiet: bool
+) -> None:
+    task = task_of(config.task, skill.prior, config.hindsight.rows)
+    scene = skill.prior.tokenizer.config.scene
+    world = replace(in_scene(config.env, scene), episode_seconds=config.hindsight.seconds + 1)
+    env = Env(world, task, rows=config.hindsight.rows, threads=threads, seed=seed)
+    policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy)
+    story = f"hindsight, {config.hindsight.rounds} rounds"
+    own = {"task": to_dict(config.task), "policy": to_dict(config.policy), "adapter": to_dict(config.adapter)}
+    hindsight(
+        policy,
+        env,
+        config.hindsight,
+        out,
+        evaluate=lambda: _judge(policy, skill, config, seed, threads),
+        keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
+        identity=identity | own,
+        seed=seed,
+        quiet=quiet,
+    )
+
+
+def _judge(policy: TokenPolicy, skill: Skill, config: FinetuneConfig, seed: int, threads: int) -> TaskScore:
+    """What chooses the best of a run: the same episodes every time, which no `evaluate task` asks for."""
+    played = play(
+        policy.controller(torch.Generator().manual_seed(seed + JUDGE)),
+        config.task,
+        skill.prior,
+        episodes=config.eval_episodes,
+        seconds=config.eval_seconds,
+        seed=seed + JUDGE,
+        threads=threads,
+    )
+    return played.score
+
+
+def _keep(skill: Skill, config: FinetuneConfig, out: Path, story: str, start: str, seed: int, score: TaskScore) -> None:
+    begun = f", from the adapter {start[:12]}" if start else ""
+    found = f"{config.eval_episodes} episodes of {config.eval_seconds:g} s, which chose the best of the run"
+    card = skill_card(skill, story + begun, seed, found, score.measures)
+    skill.save_pretrained(out, card, {"skill": start} if start else {})
 
 
 def _reinforce(
-    skill: Skill, policy: TokenPolicy, env: Env, config: FinetuneConfig, out: Path, *, base, clips, seed, threads, quiet
+    skill: Skill, config: FinetuneConfig, out: Path, identity: dict, *, seed: int, threads: int, quiet: bool
 ) -> None:
-    critic = Critic(env.obs_size, config.critic)
-    identity = {
-        "stage": to_dict(config),
-        "prior": fingerprint(skill.prior.gpt),
-        "tokenizer": skill.prior.tokenizer.hash,
-        "clips": [clip.name for clip in clips],
-        "seed": seed,
-    }
+    task = task_of(config.task, skill.prior, config.rows)
+    world = in_scene(config.env, skill.prior.tokenizer.config.scene)
+    env = Env(world, task, rows=config.rows, threads=threads, seed=seed)
+    policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy)
+    torch.manual_seed(seed)  # an earlier method may have run in this process or in another one
     run = Training(
         out=out,
         world=env,
         policy=policy,
-        critic=critic,
+        critic=Critic(env.obs_size, config.critic),
         config=config.ppo,
-        modules={"adapted": skill.adapted},
-        identity=identity,
+        modules={"adapter": policy},
+        identity={"stage": to_dict(config)} | identity,
         kinds={"stage": FinetuneConfig},
         seed=seed,
     )
 
-    def evaluate() -> TaskScore:
-        controller = policy.controller(torch.Generator().manual_seed(seed + 1))
-        played = play(
-            controller,
-            config.task,
-            skill.prior,
-            episodes=config.eval_episodes,
-            seconds=config.eval_seconds,
-            push=0.0,
-            seed=seed + 1,
-            threads=threads,
-        )
-        return played.score
-
-    def keep(score: TaskScore) -> None:
-        skill.save_pretrained(out, base=base, card=skill_card(skill, config, seed, clips, score.measures))
-
-    run.train(
+    story = f"reinforcement learning, {config.samples:,} control steps at most"
+    conditioner = skill.adapted.conditioner
+    progress = run.train(
         samples=config.samples,
         eval_every=config.eval_every,
-        evaluate=evaluate,
-        keep=keep,
+        evaluate=lambda: _judge(policy, skill, config, seed, threads),
+        keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
         critic_warmup=config.critic_warmup,
+        warm=conditioner is not None and float(conditioner.norm.count) > 0,
         title=f"finetune {config.task.kind}",
         quiet=quiet,
     )
-    skill.adapted.load_adapter_state_(load_artifact(out, "adapter", ADAPTER).tensors)
+    if not quiet and progress.score is not None:
+        best = {name: round(value, 3) for name, value in progress.score["measures"].items() if type(value) is float}
+        print(f"best evaluation: {best}; {out}")
 
 
-def skill_card(skill: Skill, config: FinetuneConfig, seed: int, clips: Sequence[Clip], measures: dict[str, Any]) -> str:
-    """The model card: use, training, results and limits."""
-    trainable, base, share = parameters_of(skill.adapted)
-    numbers = "\n".join(f"| {name} | {value:.3f} |" for name, value in measures.items() if isinstance(value, float))
-    examples = f" Example clips: {', '.join(clip.name for clip in clips)}." if clips else ""
-    return f"""# Skill `{config.task.kind}`: a {config.adapter.kind} adapter of a motion prior
+def skill_card(skill: Skill, story: str, seed: int, found: str, measures: dict) -> str:
+    """The model card: use, training, results and limits. found: what the measures are of."""
+    count, frozen, share = parameters_of(skill.adapted)
+    rows = "\n".join(f"| {name} | {value:.3f} |" for name, value in measures.items() if isinstance(value, float))
+    config = skill.adapted.config
+    return f"""# Skill `{skill.task.kind}`: a {config.kind} adapter of a motion prior
 
     kinetok sample --adapter PATH --out skill.mp4
     kinetok evaluate task --adapter PATH --json task.json
 
-- Task: `{to_dict(config.task)}`
-- Adapter: {trainable:,} parameters beside {base:,} frozen ones ({share:.1%}); `{to_dict(config.adapter)}`
-- Tokens are drawn from the adapted distribution within the frozen prior's nucleus: `{to_dict(config.policy)}`
-- Training: {" -> ".join(config.methods)}; {config.samples:,} control steps at most of reinforcement learning.
-  Seed {seed}.{examples}
+- Task: `{to_dict(skill.task)}`
+- Adapter: {count:,} parameters beside {frozen:,} frozen ones ({share:.1%}); `{to_dict(config)}`
+- Tokens are drawn from the adapted distribution within the frozen prior's nucleus: `{to_dict(skill.policy)}`
+- Training: {story}. Seed {seed}.
 
-## Last good evaluation, {config.eval_episodes} episodes of {config.eval_seconds:g} s
+## {found}
 
 | measure | value |
 |---|---|
-{numbers}
+{rows}
 
 Limits: flat floor; the prior it bends, and no other. Licence: Apache-2.0.
 """

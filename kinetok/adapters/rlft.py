@@ -1,11 +1,12 @@
 """Reinforcement learning fine-tuning: PPO over the tokens of a control step (GPC sec. 7.2, app. D).
 
-    policy = TokenPolicy(adapted, prior.tokenizer, task.layout, TokenPolicyConfig())
-    score = play(policy.controller(generator), task_config, prior, episodes=64)
+    policy = TokenPolicy(adapted, prior.tokenizer, TokenPolicyConfig())
+    played = play(policy.controller(generator), task_config, prior, episodes=64)
 
 An action is the S tokens of a step; its log-probability is the sum over them, its advantage one for all. The
-frozen prior's nucleus bounds what may be drawn (policy.py). `play` measures any controller on a task: a fine-tuned
-prior, the prior alone, a network that knows no tokens.
+frozen prior's nucleus bounds what may be drawn (policy.py). Observations are state | task, as the tasks lay them
+out (sim.tasks.upright). `play` measures any controller on a task: a fine-tuned prior, the prior alone, a network
+that knows no tokens.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 
 from kinetok.adapters.adapted import Adapted
 from kinetok.adapters.policy import draw, new_caches, score
+from kinetok.config import ConfigError
 from kinetok.gpt.controller import Prior
 from kinetok.gpt.data import Starts
 from kinetok.rl.policy import Assessment
@@ -31,25 +33,30 @@ Controller = Callable[[Tensor], Tensor]  # observations (N, O) -> PD targets (N,
 
 @dataclass(frozen=True, kw_only=True)
 class TokenPolicyConfig:
-    """top_p: mass of the frozen prior's nucleus, 1 for no bound; temperature; kl: weight of the divergence from the
-    prior in the loss; entropy: weight of the bonus (NCP: top_p 1, kl 0.05, entropy 0.01)."""
+    """top_p: mass of the frozen prior's nucleus, 1 for no bound; temperature: divides the logits (GPC table 12); kl:
+    weight of the divergence from the prior in the loss, nats a step; entropy: weight of the bonus (NCP: top_p 1,
+    kl 0.05, entropy 0.01)."""
 
     top_p: float = 0.9
     temperature: float = 1.0
     kl: float = 0.0
     entropy: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not 0.0 < self.top_p <= 1.0:
+            raise ConfigError(f"top_p must lie in (0, 1], not {self.top_p}; 1 keeps every token")
+        if not (self.temperature > 0.0 and self.kl >= 0.0 and self.entropy >= 0.0):
+            raise ConfigError(f"a temperature is above 0, the weights kl and entropy are not below it: {self}")
+
 
 class TokenPolicy:
     """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them.
 
-    layout: columns of the observation, "state" and "task"."""
+    Its state is the adapter's alone."""
 
-    def __init__(
-        self, adapted: Adapted, tokenizer: MotionTokenizer, layout: dict[str, slice], config: TokenPolicyConfig
-    ):
-        self.adapted, self.tokenizer, self.layout, self.config = adapted, tokenizer, layout, config
-        self.tokens = tokenizer.layout
+    def __init__(self, adapted: Adapted, tokenizer: MotionTokenizer, config: TokenPolicyConfig):
+        self.adapted, self.tokenizer, self.config = adapted, tokenizer, config
+        self.tokens, self.state_dim = tokenizer.layout, adapted.base.config.state_dim
         self._caches = new_caches(adapted, 1)
 
     def draw(self, obs: Tensor, generator: torch.Generator | None) -> tuple[Tensor, dict[str, Tensor]]:
@@ -90,23 +97,30 @@ class TokenPolicy:
         return Assessment(log_prob=found.log_prob, kl=(change.exp() - 1 - change).mean(), loss=loss, metrics=metrics)
 
     def observe(self, obs: Tensor) -> None:
-        self.adapted.observe(obs[..., self.layout["task"]])
+        self.adapted.observe(obs[..., self.state_dim :])
 
     def parameters(self) -> Iterable[nn.Parameter]:
         return self.adapted.trainable()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.adapted.adapter_state()
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.adapted.load_adapter_state_(state)
 
     def controller(self, generator: torch.Generator | None) -> Controller:
         """The policy as it is played; without a generator greedily."""
         return lambda obs: self.draw(obs, generator)[0]
 
     def _parts(self, obs: Tensor) -> tuple[Tensor, Tensor | None]:
-        c = obs[:, self.layout["task"]] if self.adapted.cond_dim else None
-        return obs[:, self.layout["state"]], c
+        state, c = obs[:, : self.state_dim], obs[:, self.state_dim :]
+        return state, c if self.adapted.cond_dim else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskScore:
-    """measures: of a Scorecard. merit: its mean reward a step, in which a fallen row earns what it earns."""
+    """measures: of a Scorecard. merit: the return, rewards up to a row's first fall, where training's episodes end
+    too: what comes after one is not what was trained."""
 
     measures: dict[str, Any]
 
@@ -123,7 +137,8 @@ class TaskScore:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Played:
-    """score; qpos (T, K, nq) and markers (T lists) of the first K = `record` rows, in frames of `fps`."""
+    """score; qpos (T, K, nq) of the first K = `record` rows, and markers (T lists) of the first row, in frames of
+    `fps`."""
 
     score: TaskScore
     qpos: np.ndarray
@@ -159,7 +174,11 @@ def play(
     record: int = 0,
 ) -> Played:
     """Let `episodes` characters do the task for `seconds` without resets, and measure. record: rows to keep for a
-    video. push: m/s added to the root's horizontal velocity every push_seconds."""
+    video. push: m/s added to the root's horizontal velocity every push_seconds. Same seed and controller, same
+    result, at any number of threads."""
+    steps = round(seconds * prior.fps)
+    if steps < 1 or episodes < 1:
+        raise ValueError(f"{episodes} episodes of {seconds:g} s hold no control step of 1/{prior.fps} s")
     task = task_of(config, prior, episodes)
     world = EnvConfig(
         scene=prior.tokenizer.config.scene,
@@ -175,10 +194,10 @@ def play(
     qpos: list[np.ndarray] = []
     markers: list[list[Marker]] = []
     with torch.no_grad(), torch_threads(1):
-        for _ in range(round(seconds * prior.fps)):
+        for _ in range(steps):
             if record:
                 qpos.append(env.sim.qpos[:record].copy())
-                markers.append([marker for row in range(record) for marker in task.markers(row)])
+                markers.append(task.markers(0))
             step = env.step(controller(torch.from_numpy(obs)).numpy())
             card.add(step.reward, step.terminated, task.measure(env.sim.state()))
             obs = step.obs

@@ -1,23 +1,28 @@
 """Supervised fine-tuning: make the tokens of a few example clips more likely (GPC sec. 7.3).
 
-    supervise(adapted, prior.tokenizer, clips, asked, SFTConfig(), out, save=save, seed=0)
+    supervise(adapted, prior.tokenizer, clips, SFTConfig(), out, identity={}, save=save, seed=0)
 
 The frozen tokenizer tracks the clips; what it chose, in the states it chose it in, is the data, and cross-entropy
-moves the adapter. The clips ask for nothing: the task observation of each sample is drawn at random from `asked`,
-so that the style comes whatever the task will say.
+moves the adapter. Whole worlds are held out; the best evaluation of them is kept.
+
+The clips ask for nothing, so the nets that read the task observation stay at their start, where it changes nothing:
+the style comes whatever the task says, exactly, and reinforcement learning finds them untouched.
 """
 
+import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kinetok.adapters.adapted import Adapted, fingerprint
+from kinetok.adapters.adapted import Adapted
 from kinetok.checkpoint import flatten, load_state, save_state, unflatten
-from kinetok.config import to_dict
-from kinetok.gpt.data import record
+from kinetok.config import ConfigError, to_dict
+from kinetok.gpt.data import TokenDataset, record
 from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
@@ -26,11 +31,14 @@ from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 
+EVAL_SAMPLES = 4096
+
 
 @dataclass(frozen=True, kw_only=True)
 class SFTConfig:
     """samples: control steps recorded, in `rows` worlds; iterations of `batch` samples; lr, falling to a tenth;
-    label_smoothing; code_noise, transitions: as in recording for a prior; eval_every: iterations."""
+    label_smoothing; code_noise, transitions, env: as in recording for a prior; held_out: share of worlds; eval_every:
+    iterations."""
 
     samples: int = 50_000
     rows: int = 64
@@ -44,44 +52,52 @@ class SFTConfig:
     eval_every: int = 50
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.3)
 
+    def __post_init__(self) -> None:
+        for name in ("samples", "rows", "iterations", "batch", "eval_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.held_out < 1 or (self.held_out and self.rows < 2):
+            raise ConfigError(f"held_out is a share of the {self.rows} rows that leaves some, not {self.held_out}")
+
 
 def supervise(
     adapted: Adapted,
     tokenizer: MotionTokenizer,
     clips: Sequence[Clip],
-    asked: Tensor,
     config: SFTConfig,
     out: Path,
     *,
+    identity: dict[str, Any],
     save: Callable[[dict[str, float]], None],
     seed: int = 0,
     threads: int = 0,
     quiet: bool = False,
 ) -> dict[str, float]:
-    """Adapt in place; returns the last metrics. asked (M, cond_dim): task observations to draw from. save(metrics) is
-    called at every evaluation; `out` receives metrics.jsonl and a state from which a later call goes on."""
+    """Adapt in place; returns the metrics of the best evaluation, whose adapter is not the last.
+
+    identity: what else than the configuration and the clips a run must share with another to go on from it.
+    save(metrics): called at each evaluation that is the best so far by held-out cross-entropy, or at every one where
+    nothing is held out. `out` receives metrics.jsonl and a state from which a later call goes on, bit for bit.
+    """
     library = ClipLibrary.of(clips)
-    identity = {
-        "stage": to_dict(config),
-        "prior": fingerprint(adapted.base),
-        "tokenizer": tokenizer.hash,
-        "adapter": to_dict(adapted.config),
-        "clips": list(library.names),
-        "seed": seed,
-    }
-    path, step, metrics = out / "state.safetensors", 0, {}
-    optimizer = torch.optim.Adam(adapted.trainable(), lr=config.lr, fused=True)
+    frames = hashlib.sha256(library.frames.tobytes()).hexdigest()
+    identity = {"sft": to_dict(config), "frames": frames} | identity
+    path, step, best = out / "state.safetensors", 0, {"held_out/cross_entropy": math.inf}
+    parameters = [p for p in adapted.gpt.parameters() if p.requires_grad]  # all but the nets that read c
+    optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
     generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)  # dropout's
     if path.exists():
         tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, {"stage": SFTConfig})
+        refuse_changed(path, meta["identity"], identity, {"sft": SFTConfig})
         tree = unflatten(tensors, meta["tree"])
-        adapted.load_adapter_state_(tree["adapted"])
+        adapted.load_adapter_state_(tree["adapter"])
         optimizer.load_state_dict(tree["optimizer"])
         generator.set_state(tree["generator"])
-        step, metrics = meta["step"], tree["metrics"]
+        torch.set_rng_state(tree["dropout"])
+        step, best = meta["step"], tree["best"]
     if step >= config.iterations:
-        return metrics
+        return best
     table = ReferenceTable(library, control_hz=tokenizer.config.scene.control_hz)
     data = record(
         tokenizer,
@@ -96,41 +112,59 @@ def supervise(
         quiet=quiet,
     )
     learn, hold = data.split(config.held_out)
-    conditioned = adapted.cond_dim > 0
-
-    def loss(ids: Tensor, smoothing: float) -> tuple[Tensor, dict[str, Tensor]]:
-        c = asked[torch.randint(len(asked), (len(ids),), generator=generator)] if conditioned else None
-        return adapted.loss(data.states[ids], c, data.tokens[ids].long(), smoothing)
-
+    hold = hold[torch.linspace(0, len(hold) - 1, min(len(hold), EVAL_SAMPLES)).long()] if len(hold) else hold
     with Logger(out, total=config.iterations, title="sft", start=step, quiet=quiet) as log:
         while step < config.iterations:
             for group in optimizer.param_groups:
                 group["lr"] = config.lr * (1 - 0.9 * step / config.iterations)
             ids = learn[torch.randint(len(learn), (config.batch,), generator=generator)]
-            value, told = loss(ids, config.label_smoothing)
+            value, told = _loss(adapted.train(), data, ids, config.label_smoothing)
             if not torch.isfinite(value):
                 raise FloatingPointError(
-                    f"the loss is {value.item()} at iteration {step}; the last good state is {path}; "
-                    "try a smaller --set sft.lr"
+                    f"the loss is {value.item()} at iteration {step}; the last good state, if there is one yet, is "
+                    f"{path}; try a smaller --set sft.lr"
                 )
             optimizer.zero_grad(set_to_none=True)
             value.backward()
-            torch.nn.utils.clip_grad_norm_(adapted.trainable(), 1.0)
+            torch.nn.utils.clip_grad_norm_(parameters, 1.0)
             optimizer.step()
+            adapted.eval()
             step += 1
             metrics = {f"sft/{name}": float(number) for name, number in told.items()}
-            if step % config.eval_every == 0 or step == config.iterations:
-                with torch.no_grad():
-                    held = loss(hold[:4096], 0.0)[1]
-                metrics |= {f"held_out/{name}": float(number) for name, number in held.items()}
-                save(metrics)
+            evaluating = step % config.eval_every == 0 or step == config.iterations
+            if evaluating:
+                found = evaluate(adapted, data, hold)
+                metrics |= found
+                if not len(hold) or found["held_out/cross_entropy"] < best["held_out/cross_entropy"]:
+                    best = found | {"iteration": float(step)}
+                    save(best)
+            log.write(step - 1, metrics)
+            if evaluating:
                 tree = {
-                    "adapted": adapted.adapter_state(),
+                    "adapter": adapted.adapter_state(),
                     "optimizer": optimizer.state_dict(),
                     "generator": generator.get_state(),
-                    "metrics": metrics,
+                    "dropout": torch.get_rng_state(),
+                    "best": best,
                 }
                 tensors, skeleton = flatten(tree)
                 save_state(path, tensors, {"tree": skeleton, "identity": identity, "step": step})
-            log.write(step - 1, metrics)
-    return metrics
+    return best
+
+
+@torch.no_grad()
+def evaluate(adapted: Adapted, data: TokenDataset, ids: Tensor) -> dict[str, float]:
+    """Cross-entropy in nats per token and accuracy on the samples ids; nothing where there are none."""
+    sums = dict.fromkeys(("cross_entropy", "accuracy"), 0.0)
+    for part in ids.split(1024):
+        metrics = _loss(adapted, data, part)[1]
+        sums = {name: total + float(metrics[name]) * len(part) for name, total in sums.items()}
+    return {f"held_out/{name}": total / len(ids) for name, total in sums.items()} if len(ids) else {}
+
+
+def _loss(
+    adapted: Adapted, data: TokenDataset, ids: Tensor, smoothing: float = 0.0
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss and metrics of the samples ids, with a task observation of zeros, which nothing reads yet."""
+    nothing = torch.zeros(len(ids), adapted.cond_dim)
+    return adapted.loss(data.states[ids], nothing, data.tokens[ids].long(), smoothing)

@@ -12,7 +12,9 @@ the tracker fails at. The last half second before a failure is left out.
 `Roaming` joins the clips into one endless motion. Physics on a flat floor does not change when the world is
 shifted and turned, so a row goes on in another clip by having its own root moved to a frame of that clip which
 it resembles already. This happens at random (`transitions` per second) and, wherever a like frame exists,
-before a clip ends: the prior learns what follows an end, and how to change from one clip to another.
+before a clip ends: the prior learns what follows an end, and how to change from one clip to another. Where a clip
+ends and no frame is like it, the motion may go on in the likest frame further away (`reach_at_end`): the reference
+jumps, the body does not, and the tracker pulls it over. What it does then is kept unless it fails.
 """
 
 from dataclasses import dataclass, field
@@ -37,6 +39,7 @@ from kinetok.tokenizers.train import in_scene
 
 BEFORE_FAILURE = 0.5  # seconds
 REACH = 0.25  # metres of `likeness`; walk to run, or the end of a jump to standing, is about 0.2
+GRACE = 0.3  # seconds for the body to come over to a reference that jumped; less than BEFORE_FAILURE, see `Roaming`
 GLANCE = 0.1  # seconds; a velocity difference counts as the distance it makes in this time
 STARTS = 512
 
@@ -107,7 +110,9 @@ class Roaming(Tracking):
 
     `over` leaves the frame at which each row is to go on in `landing` (rows,), -1 for most; `land` moves it there.
     A clip's last `tail` steps, in which the window ahead begins to stand still, are left at a moment drawn
-    uniformly. A row that resembles no frame of any clip at its clip's end is truncated, as in Tracking.
+    uniformly. A row whose clip is over and that resembles no frame within `reach` goes on in the likest frame of all
+    within `reach_at_end`, and without one it is truncated, as in Tracking. After such a jump no error is a failure for
+    GRACE; one that is still too large then is, so that the samples since the jump are among those before a failure.
     """
 
     def __init__(
@@ -119,31 +124,37 @@ class Roaming(Tracking):
         transitions: float,
         rng: np.random.Generator,
         reach: float = REACH,
+        reach_at_end: float = REACH,
     ):
         super().__init__(config, table, rows=rows)
         self.weights.values = clip_weights(table)
         self.landing = np.full(rows, -1)
-        self.tail, self._rng, self._reach = max(config.future), rng, reach
+        self.tail, self._rng, self._reach, self._reach_at_end = max(config.future), rng, reach, reach_at_end
+        self._grace = np.zeros(rows, int)  # steps left in which no error is a failure
+        self._jumps = np.zeros(rows, bool)  # whether `landing` is further than `reach`
         self._chance = transitions / table.control_hz
         # A clip is entered at any phase of its first cycle, or where at least a tail or half of it is left.
         span = table.last - table.first
         latest = np.where(span > table.cycle, table.cycle - 1, np.maximum(span - self.tail, span // 2))
         self._entries = np.concatenate([np.arange(a, a + b + 1) for a, b in zip(table.first, latest, strict=True)])
         self._edges = np.cumsum(latest + 1) - (latest + 1)
+        self._owner = np.repeat(np.arange(len(table.names)), latest + 1)
         self._features = likeness(table.body.rows(self._entries))
 
     def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        self.landing[ids] = -1
+        self.landing[ids], self._grace[ids] = -1, 0
         return super().start(ids, rng)
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
         terminated, over = super().over(body)
+        terminated &= (self._grace == 0) | ~np.isfinite(self.error).all(1)
+        self._grace = np.maximum(self._grace - 1, 0)
         left = self.table.last[self.clip] - self.frame
         chance = np.where(left <= self.tail, 1 / np.maximum(left, 1), self._chance)
         seeking = np.flatnonzero((self._rng.random(len(left)) < chance) & ~terminated)
-        self.landing[:] = -1
+        self.landing[:], self._jumps[:] = -1, False
         if len(seeking):
-            self.landing[seeking] = self._nearest(body.rows(seeking), seeking, left[seeking] <= self.tail)
+            self.landing[seeking], self._jumps[seeking] = self._nearest(body.rows(seeking), seeking, left[seeking])
         return terminated, over & (self.landing < 0)
 
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
@@ -156,25 +167,34 @@ class Roaming(Tracking):
             return
         frame = self.landing[ids]
         self.place(ids, np.searchsorted(self.table.first, frame, side="right") - 1, frame)
+        self._grace[ids] = np.where(self._jumps[ids], round(GRACE * self.table.control_hz), 0)
         self.landing[ids] = -1
         place = self.table.root[frame, :2], self.table.heading[frame]
         env.sim.set_state(ids, *moved(env.sim.qpos[ids], env.sim.qvel[ids], *place))
         obs[ids] = self.observe(env.sim.state(ids), ids)
 
-    def _nearest(self, body: BodyState, ids: np.ndarray, ending: np.ndarray) -> np.ndarray:
-        """The likest frame (k,) in a random one of the clips within reach; -1 without. Its own clip only if ending."""
+    def _nearest(self, body: BodyState, ids: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where rows ids with `left` (k,) steps of their clip may go on, frames (k,) or -1, and whether it is a jump.
+
+        The likest frame in a random one of the clips within reach; where the clip is over and none is within reach,
+        the likest of all within reach_at_end. Of its own clip, only in the tail, and only what is a tail or more ago:
+        the frames just behind are always the likest, and the motion would stutter.
+        """
         own = likeness(body)
         squares = (own**2).sum(1)[:, None] + (self._features**2).sum(1) - 2 * own @ self._features.T
+        latest = np.where(left <= self.tail, self.frame[ids] - self.tail, -1)
+        squares[(self._owner == self.clip[ids, None]) & (self._entries > latest[:, None])] = np.inf
         best = np.minimum.reduceat(squares, self._edges, axis=1)
-        best[np.flatnonzero(~ending), self.clip[ids[~ending]]] = np.inf
         near = best < self._reach**2
         chosen = np.where(near, self._rng.random(near.shape), -1).argmax(1)
+        jumps = ~near.any(1) & (left <= 0) & (best.min(1) < self._reach_at_end**2)
+        chosen[jumps] = best[jumps].argmin(1)
         stop = np.append(self._edges[1:], len(self._entries))
         frame = np.full(len(ids), -1)
-        for row in np.flatnonzero(near.any(1)):
+        for row in np.flatnonzero(near.any(1) | jumps):
             first = self._edges[chosen[row]]
             frame[row] = self._entries[first + squares[row, first : stop[chosen[row]]].argmin()]
-        return frame
+        return frame, jumps
 
 
 def likeness(body: BodyState) -> np.ndarray:
@@ -241,19 +261,20 @@ def record(
     env: EnvConfig | None = None,
     transitions: float = 0.3,
     code_noise: float = 0.0,
+    reach_at_end: float = REACH,
     quiet: bool = False,
 ) -> TokenDataset:
     """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
 
     env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of the scalars whose
     executed code is one level off while the recorded one is not, so that the data shows how to go on from the states
-    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). The result
-    depends on `seed` and not on `threads`.
+    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). transitions, reach_at_end:
+    see `Roaming`. The result depends on `seed` and not on `threads`.
     """
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 1])
     tracking = TrackingConfig(future=tokenizer.config.future)
-    task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng)
+    task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng, reach_at_end=reach_at_end)
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part = -(-samples // rows), task.layout["state"]
     states = torch.empty(steps, rows, part.stop - part.start)

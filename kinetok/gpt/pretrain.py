@@ -27,7 +27,7 @@ from torch import Tensor
 from kinetok.checkpoint import CheckpointError, flatten, load_artifact, load_state, save_state, unflatten
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, noted_path
-from kinetok.gpt.data import TokenDataset, record
+from kinetok.gpt.data import REACH, TokenDataset, record
 from kinetok.gpt.model import GPT, GPTConfig
 from kinetok.gpt.refine import RefineConfig, refine
 from kinetok.logger import Logger
@@ -42,7 +42,8 @@ from kinetok.tokenizers.tokenizer import MotionTokenizer
 THREADS = 2  # of torch, where none are asked for: one number everywhere keeps results the same everywhere
 EVAL_SAMPLES = 8192
 LOG_EVERY = 20
-RECORDING = ("samples", "rows", "transitions", "code_noise", "env")  # settings that decide the recorded data
+# Settings that decide the recorded data.
+RECORDING = ("samples", "rows", "transitions", "code_noise", "reach_at_end", "env")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +51,8 @@ class PretrainConfig:
     """width, layers, heads, head, head_width, dropout: of the GPT (see GPTConfig).
 
     samples: control steps to record. rows: worlds that record. transitions: changes of clip per second. code_noise:
-    share of scalars whose executed code is one level off. env: pushes,
-    noise and episodes of the recording.
+    share of scalars whose executed code is one level off. reach_at_end: how far, in metres of gpt.data's likeness, a
+    motion may jump where its clip ends and nothing nearer follows. env: pushes, noise and episodes of the recording.
     iterations of batch samples; lr falls by a cosine to lr_end after warmup iterations. weight_decay: of matrices.
     label_smoothing. ema: factor of the averaged weights. state_noise: standard deviations. held_out: share of worlds.
     eval_every: iterations between evaluations, saves included.
@@ -67,6 +68,7 @@ class PretrainConfig:
     rows: int = 256
     transitions: float = 0.3
     code_noise: float = 0.0
+    reach_at_end: float = REACH
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.5)
     iterations: int = 3000
     batch: int = 512
@@ -307,6 +309,7 @@ def _recorded(
         env=config.env,
         transitions=config.transitions,
         code_noise=config.code_noise,
+        reach_at_end=config.reach_at_end,
         quiet=quiet,
     )
     data.save(path, identity | {"config": to_dict(config)})

@@ -37,7 +37,7 @@ DOWN, UP = 0.5, 0.62  # metres of the root: a fall goes from above UP to below D
 class RefineConfig:
     """rounds: 0 for none; rows, seconds: played in each; top_p: of the play, wider than in use; doomed: seconds before
     a fall that are left out; patience: seconds granted to a start on the floor; iterations of `batch` samples, half of
-    them the prior's own; memory: rounds whose samples are kept; ema: of the weights that play and are kept; state_noise:
+    them the prior's own; memory: rounds whose samples are kept; ema: of the weights that play; state_noise:
     in standard deviations; episodes of `survive` seconds measure each round."""
 
     rounds: int = 6

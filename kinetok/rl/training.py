@@ -5,28 +5,35 @@
     progress = run.train(samples=1_000_000, eval_every=100_000, evaluate=evaluate, keep=keep)
 
 `out` receives metrics.jsonl and state.safetensors: a later call with the same identity goes on bit for bit where
-that state was written. The first rollout of a fresh policy only sets the normalisers. A loss that is not finite
-stops the run, keeps the last good state and dumps the offending rollout.
+that state was written. The first rollout of a fresh policy only sets the normalisers. A reward, an observation or a
+loss that is not finite stops the run, keeps the last good state and dumps the offending rollout.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
-from torch import nn
 
 from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
-from kinetok.config import diff, from_dict, to_dict
+from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.logger import Logger
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
 from kinetok.rl.rollout import Rollout, World, collect
+
+
+class Part(Protocol):
+    """What a run trains, as far as saving goes; any nn.Module is one."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
 
 
 class Score(Protocol):
@@ -36,6 +43,9 @@ class Score(Protocol):
     def merit(self) -> float: ...
     def summary(self) -> dict[str, float]: ...
     def to_json(self) -> dict: ...
+
+
+S = TypeVar("S", bound=Score)
 
 
 @dataclass
@@ -52,8 +62,9 @@ class Progress:
 
 
 class Training:
-    """The mutable parts of one training, saved and restored together. modules: every network by its name in the
-    state; identity: what a run must share with another to go on from it (JSON); kinds: classes of the configs in it."""
+    """The mutable parts of one training, saved and restored together. modules: what is trained, besides the critic, by
+    its name in the state; identity: what a run must share with another to go on from it (JSON); kinds: classes of the
+    configs in it."""
 
     def __init__(
         self,
@@ -63,13 +74,14 @@ class Training:
         policy: Policy,
         critic: Critic,
         config: PPOConfig,
-        modules: Mapping[str, nn.Module],
+        modules: Mapping[str, Part],
         identity: dict[str, Any],
         kinds: Mapping[str, type],
         seed: int,
     ):
         self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
-        self.modules, self.identity, self.kinds = {"critic": critic, **modules}, identity, kinds
+        self.modules: dict[str, Part] = {"critic": critic, **modules}
+        self.identity, self.kinds = identity, kinds
         self.optimizers = Optimizers(policy, critic, config)
         self.generator = torch.Generator().manual_seed(seed)
 
@@ -82,8 +94,8 @@ class Training:
         *,
         samples: int,
         eval_every: int,
-        evaluate: Callable[[], Score],
-        keep: Callable[[Score], None],
+        evaluate: Callable[[], S],
+        keep: Callable[[S], None],
         finished: Callable[[Progress], bool] = lambda progress: False,
         schedule: Callable[[float], None] = lambda share: None,
         critic_warmup: int = 0,
@@ -101,7 +113,7 @@ class Training:
         progress = self.resume()
         per_iteration = self.world.rows * self.config.horizon
         start = progress.samples + per_iteration
-        with Logger(self.out, total=samples, title=title, start=start, quiet=quiet) as log:
+        with Logger(self.out, total=samples, title=title, start=start, stride=per_iteration, quiet=quiet) as log:
             obs = torch.from_numpy(self.world.reset(spread=True))
             while progress.samples < samples and not finished(progress):
                 schedule(min(progress.samples / samples, 1.0))
@@ -110,10 +122,11 @@ class Training:
                 )
                 obs = rollout.last_obs
                 first = progress.iteration == 0
-                metrics = {} if first else self.learn(rollout, train_actor=progress.iteration > critic_warmup)
-                if not (first and warm):
-                    self.policy.observe(rollout.obs)
-                self.critic.observe(rollout.obs)
+                with self._stopping(rollout):
+                    metrics = {} if first else self.learn(rollout, train_actor=progress.iteration > critic_warmup)
+                    if not (first and warm):
+                        self.policy.observe(rollout.obs)
+                    self.critic.observe(rollout.obs)
                 progress.iteration += 1
                 progress.samples += per_iteration
                 due = progress.samples >= min(progress.evaluated + eval_every, samples)
@@ -132,35 +145,44 @@ class Training:
         return progress
 
     def learn(self, rollout: Rollout, *, train_actor: bool = True) -> dict[str, float]:
-        """One PPO update; FloatingPointError, with the rollout dumped, when anything is not finite."""
+        """One PPO update; FloatingPointError when anything is not finite."""
         config = self.config
+        advantages, targets = gae(
+            rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
+        )
+        metrics = update(
+            self.policy,
+            self.critic,
+            self.optimizers,
+            rollout,
+            advantages,
+            targets,
+            config,
+            generator=self.generator,
+            train_actor=train_actor,
+        )
+        # The last minibatch's gradient has no later loss that would show it.
+        finite = [torch.isfinite(p).all() for p in (*self.optimizers.parameters, *self.critic.parameters())]
+        if not (np.isfinite(list(metrics.values())).all() and torch.stack(finite).all()):
+            raise FloatingPointError(f"parameters or metrics are not finite: {metrics}")
+        return metrics | {"failed_simulations": self.world.failed_simulations}
+
+    @contextmanager
+    def _stopping(self, rollout: Rollout) -> Iterator[None]:
+        """Refuse a rollout that is not finite; dump it where what is done with it is not, and say what is left."""
         try:
-            advantages, targets = gae(
-                rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
-            )
-            metrics = update(
-                self.policy,
-                self.critic,
-                self.optimizers,
-                rollout,
-                advantages,
-                targets,
-                config,
-                generator=self.generator,
-                train_actor=train_actor,
-            )
-            # The last minibatch's gradient has no later loss that would show it.
-            finite = [torch.isfinite(p).all() for p in (*self.optimizers.parameters, *self.critic.parameters())]
-            if not (np.isfinite(list(metrics.values())).all() and torch.stack(finite).all()):
-                raise FloatingPointError(f"parameters or metrics are not finite: {metrics}")
+            bad = ~torch.isfinite(rollout.rewards)
+            if bad.any():
+                raise FloatingPointError(f"{int(bad.sum())} of {bad.numel()} rewards are not finite")
+            yield
         except FloatingPointError as error:
             dump = self.out / "bad_rollout.safetensors"
             save_state(dump, {"obs": rollout.obs, "rewards": rollout.rewards, **rollout.taken}, {})
+            left = f"the last good state in {self.path} is untouched" if self.path.exists() else "nothing was saved yet"
             raise FloatingPointError(
-                f"{error}; training stopped. The rollout is in {dump}; the last good state in {self.path} is "
-                "untouched. Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
+                f"{error}; training stopped. The rollout is in {dump}; {left}. "
+                "Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
             ) from error
-        return metrics | {"failed_simulations": self.world.failed_simulations}
 
     def save(self, progress: Progress) -> None:
         """Write the state, from which `resume` goes on."""
@@ -191,7 +213,18 @@ def refuse_changed(path: Path, old: dict, new: dict, kinds: Mapping[str, type]) 
     kinds: the config class behind keys of the identity: a setting that the old one does not know had its default.
     A longer run is the same run: where both say `stage.samples`, the new one may be larger.
     """
-    old = old | {key: to_dict(from_dict(kind, old[key])) for key, kind in kinds.items()}
+    missing = [key for key in kinds if key not in old]
+    if missing:
+        raise CheckpointError(
+            f"{path} is the state of another kind of run: it has no {missing[0]}; choose another --out"
+        )
+    try:
+        old = old | {key: to_dict(from_dict(kind, old[key], key)) for key, kind in kinds.items()}
+    except ConfigError as error:
+        raise CheckpointError(
+            f"{path} is the state of another kind of run, or of another version of kinetok ({error}); "
+            "choose another --out"
+        ) from error
     before, now = old.get("stage", {}).get("samples", 0), new.get("stage", {}).get("samples", 0)
     if now > before:
         old["stage"] = old["stage"] | {"samples": now}

@@ -8,20 +8,27 @@
 
 `stages=("ppo",)` trains end to end from nothing, the paper's form. The artifact in `out` itself is the best of
 the student stages by the same evaluation, and its card says which stages made it. Teachers are independent, so
-they train side by side, one core each; the result does not depend on how many do.
+they train side by side, one core each; the result does not depend on how many do. At the end stands a table of how
+well each clip is followed, by the tokenizer and by its teacher.
 """
 
 import multiprocessing
+import multiprocessing.connection
+import os
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from rich.console import Console
+from rich.table import Table
 
 from kinetok.checkpoint import load_artifact, load_state, refuse_foreign, save_artifact
-from kinetok.config import ConfigError, nearest, to_dict
+from kinetok.config import ConfigError, at_least, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.ppo import PPOConfig
@@ -77,13 +84,16 @@ class FitConfig:
     workers: int = 2
 
     def __post_init__(self) -> None:
+        at_least(self, 1, {"workers": "1 trains one teacher after the other"})
+        if not self.stages:
+            raise ConfigError(f"stages is empty; name one or more of: {', '.join(STAGES)}")
         for stage in self.stages:
             if stage not in STAGES:
                 raise ConfigError(f"unknown stage {stage!r}{nearest(stage, STAGES)}; stages: {', '.join(STAGES)}")
         for stage in (self.teacher, self.distill, self.ppo):
             in_scene(stage.env, self.tokenizer.scene)
         missing = set(self.teacher_tokenizer.future) - set(self.tokenizer.future)
-        if missing:
+        if missing and "distill" in self.stages:
             raise ConfigError(
                 f"teacher_tokenizer.future looks {sorted(missing)} steps ahead, which tokenizer.future "
                 f"{self.tokenizer.future} does not hold; the teacher labels what the student sees"
@@ -134,7 +144,8 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     scores: dict[str, TrackingScore] = {}
     if "teacher" in config.stages:
         train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
-    story: list[str] = ["teacher"] if "teacher" in config.stages else []
+    story: list[str] = []
+    parents: dict[str, str] = {}
     if "distill" in config.stages:
         teachers = [MotionTokenizer.from_pretrained(out / "teachers" / name) for name in names]
         parents = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in names}
@@ -151,6 +162,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             mirrored=[False] * len(clips) + [True] * len(images),
             parents=parents,
         )
+        parents = {"distill": load_artifact(out / "distill").hash} | parents
     if "ppo" in config.stages:
         story.append("ppo")
         scores["ppo"] = train_ppo(
@@ -162,8 +174,11 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             threads=threads,
             title="ppo through the bottleneck",
             card=lambda score: tokenizer_card(student, table.names, " -> ".join(story), seed, score),
+            parents=parents,
         )
+    taught = _taught_numbers(out / "teachers", table.names, len(names))
     if not scores:
+        Console().print(clip_table(names, {"teacher": taught[: len(names)]}))
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
     best = max(scores, key=lambda stage: scores[stage].merit)
     artifact = load_artifact(out / best)
@@ -175,8 +190,38 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         card=(artifact.path / "README.md").read_text(encoding="utf-8"),
         parents=artifact.parents,
     )
+    found = {best: np.stack([scores[best].success, scores[best].mpjpe_mm], axis=1)}
+    Console().print(clip_table(table.names, found if np.isnan(taught).all() else found | {"teacher": taught}))
     print(f"best stage: {best}; {scores[best].summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
     return MotionTokenizer.from_pretrained(out)
+
+
+def clip_table(names: Sequence[str], found: Mapping[str, np.ndarray]) -> Table:
+    """How well each clip is followed: success and MPJPE of whoever did, the first one's hardest clips first.
+
+    found: who -> (K, 2), share of successes and millimetres; NaN where that is not known.
+    """
+    first = next(iter(found.values()))
+    table = Table("clip")
+    for who in found:
+        table.add_column(f"{who}: success", justify="right")
+        table.add_column("MPJPE mm", justify="right")
+    for k in sorted(range(len(names)), key=lambda k: (first[k, 0], -first[k, 1])):
+        cells = [
+            text for numbers in found.values() for text in (f"{100 * numbers[k, 0]:.0f} %", f"{numbers[k, 1]:.0f}")
+        ]
+        table.add_row(names[k], *("-" if text.startswith("nan") else text for text in cells))
+    return table
+
+
+def _taught_numbers(folder: Path, names: Sequence[str], teachers: int) -> np.ndarray:
+    """Success and MPJPE in mm (K, 2) of each clip's teacher as its training left it; mirror images follow the clips."""
+    numbers = np.full((len(names), 2), np.nan)
+    for k in range(len(names)):
+        state = folder / names[k % teachers] / "state.safetensors"
+        if state.exists() and (score := load_state(state)[1]["progress"]["score"]):
+            numbers[k] = score["success"][0], score["mpjpe_mm"][0]
+    return numbers
 
 
 def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
@@ -189,13 +234,26 @@ def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed:
                 _teach(*job, threads=threads, quiet=False)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, context, torch.set_num_threads, (1,)) as pool:
+    with ProcessPoolExecutor(config.workers, context, begin_worker) as pool:
         running = {pool.submit(_teach, *job, threads=1, quiet=True): job[0].name for job in jobs}
         try:
             _report(running, len(jobs))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def begin_worker() -> None:
+    """One thread for the sums of networks, and an end as soon as the parent has ended, by a signal or otherwise."""
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this runs in a pool's process
+
+    def follow() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def _report(running: dict, total: int) -> None:

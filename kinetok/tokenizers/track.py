@@ -26,20 +26,22 @@ START_NOISE = 0.01
 @dataclass(frozen=True, kw_only=True)
 class TrackingScore:
     """Per clip (K,): success, the share of episodes whose largest body error stayed below 0.5 m; success_mean_error,
-    the same of the mean body error; mpjpe_mm over all frames of all episodes; seconds survived (mean form)."""
+    the same of the mean body error; mpjpe_mm over all frames of all episodes; seconds survived (mean form); limit:
+    seconds that its episodes could last."""
 
     names: tuple[str, ...]
     success: np.ndarray
     success_mean_error: np.ndarray
     mpjpe_mm: np.ndarray
     seconds: np.ndarray
+    limit: np.ndarray
     episodes: int
 
     @property
     def merit(self) -> float:
-        """One number for keeping the best checkpoint: success counts most, then the time survived, then the error."""
-        length = self.seconds / max(self.seconds.max(), 1e-6)
-        return float((self.success + 0.2 * length - np.minimum(self.mpjpe_mm, 500) / 1000).mean())
+        """One number for keeping the best checkpoint: success counts most, then the share survived, then the error."""
+        survived = self.seconds / np.maximum(self.limit, 1e-6)
+        return float((self.success + 0.2 * survived - np.minimum(self.mpjpe_mm, 500) / 1000).mean())
 
     def summary(self) -> dict[str, float]:
         return {
@@ -55,6 +57,8 @@ class TrackingScore:
 
     @staticmethod
     def from_json(data: dict) -> "TrackingScore":
+        """Scores from before limits were kept take the longest clip's seconds for every clip's, as they did then."""
+        data = {"limit": [max(data["seconds"])] * len(data["seconds"])} | data
         arrays = {key: np.array(value) for key, value in data.items() if key not in ("names", "episodes")}
         return TrackingScore(names=tuple(data["names"]), episodes=data["episodes"], **arrays)
 
@@ -90,7 +94,8 @@ def track(
         push_regular=True,
     )
     env = Env(env_config, task, rows=rows, threads=threads, seed=seed)
-    limit = np.where(loops[fixed], round(seconds * table.control_hz), np.inf)
+    left = (table.last - table.first)[fixed] - starts
+    limit = np.where(loops[fixed], np.minimum(round(seconds * table.control_hz), left), left)
     running, failed = np.ones(rows, bool), np.zeros(rows, bool)
     largest, total, frames = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     obs = env.reset()
@@ -114,5 +119,6 @@ def track(
         success_mean_error=per_clip(~failed),
         mpjpe_mm=1000 * total.reshape(clips, episodes).sum(1) / frames.reshape(clips, episodes).sum(1),
         seconds=per_clip(frames) / table.control_hz,
+        limit=per_clip(limit) / table.control_hz,
         episodes=episodes,
     )

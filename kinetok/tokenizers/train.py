@@ -16,7 +16,8 @@ from pathlib import Path
 
 import torch
 
-from kinetok.config import ConfigError, diff, to_dict
+from kinetok.checkpoint import CheckpointError, load_state
+from kinetok.config import ConfigError, at_least, diff, to_dict
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
@@ -27,6 +28,13 @@ from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore, track
+
+COUNTS = {
+    "samples": "to leave the stage out, take its name from stages",
+    "rows": "it is the number of worlds",
+    "eval_every": "give as many as samples for a single evaluation at the end",
+    "eval_episodes": "the best artifact is found by evaluations",
+}  # of a stage, with what to do about one that is below 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +61,12 @@ class PPOStage:
     env: EnvConfig = EnvConfig()
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
+    def __post_init__(self) -> None:
+        at_least(self, 1, COUNTS)
+        at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
+        if not self.fail_mean > 0:
+            raise ConfigError(f"fail_mean must be above 0, not {self.fail_mean}; its unit is metres of mean body error")
+
 
 def train_ppo(
     actor: MotionTokenizer,
@@ -64,9 +78,15 @@ def train_ppo(
     threads: int = 0,
     title: str = "ppo",
     card: Callable[[TrackingScore], str] = lambda score: "",
+    parents: dict[str, str] | None = None,
     quiet: bool = False,
 ) -> TrackingScore:
-    """Train `actor` in place; returns the score of the best artifact, which lies in `out`."""
+    """Train `actor` in place; returns the score of the best artifact, which lies in `out`.
+
+    parents: hashes of what the actor was made from, kept in the artifact; a state that had others is refused.
+    """
+    identity = identify(config, actor.config, table.names, seed) | ({"parents": parents} if parents else {})
+    refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
     task = Tracking(
         TrackingConfig(future=future, fail_mean=config.fail_mean, reward=config.reward), table, rows=config.rows
@@ -83,7 +103,7 @@ def train_ppo(
         critic=critic,
         config=config.ppo,
         modules={"actor": actor} | ({"anchor": anchor} if anchor is not None else {}),
-        identity=identify(config, actor.config, table.names, seed),
+        identity=identity,
         kinds=KINDS | {"stage": PPOStage},
         seed=seed,
     )
@@ -98,7 +118,7 @@ def train_ppo(
         samples=config.samples,
         eval_every=config.eval_every,
         evaluate=evaluate,
-        keep=lambda score: actor.save_pretrained(out, card(score)),
+        keep=lambda score: actor.save_pretrained(out, card(score), parents),
         finished=lambda progress: good_enough(progress, config),
         schedule=spread,
         critic_warmup=config.critic_warmup,
@@ -126,6 +146,20 @@ KINDS = {"tokenizer": TokenizerConfig}  # of the identity below, besides its sta
 def identify(config: object, tokenizer: TokenizerConfig, names: Sequence[str], seed: int) -> dict:
     """What a run is, for `refuse_changed`: a state goes on only under the same."""
     return {"stage": to_dict(config), "tokenizer": to_dict(tokenizer), "seed": seed, "clips": list(names)}
+
+
+def refuse_other_parents(path: Path, parents: dict[str, str]) -> None:
+    """Raise CheckpointError where a state at `path` is of a run that was made from other artifacts than these."""
+    if not path.exists():
+        return
+    before = load_state(path)[1].get("identity", {}).get("parents", {})
+    changed = [f"{role} {before.get(role, 'none')[:12]} -> {parents.get(role, 'none')[:12]}"
+               for role in before | parents if before.get(role) != parents.get(role)]  # fmt: skip
+    if changed:
+        raise CheckpointError(
+            f"{path}: this run was made from other artifacts: {', '.join(changed)}. "
+            f"Remove {path.parent} to make it anew from these, bring the old ones back, or choose another --out"
+        )
 
 
 def good_enough(progress: Progress, config: PPOStage) -> bool:

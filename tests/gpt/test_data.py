@@ -183,9 +183,63 @@ def test_a_clip_that_ends_goes_on_in_one_that_is_alike(two_stands, humanoid):
 
 
 def test_without_a_like_frame_the_end_is_the_end(two_stands, humanoid):
-    task, env, _ = roaming(two_stands, 8, reach=0.0)
+    task, env, _ = roaming(two_stands, 8, reach=0.0, reach_at_end=0.0)
     steps = [env.step(np.zeros((8, humanoid.nu))) for _ in range(12)]
     assert all((task.landing == -1).all() for _ in steps) and any(step.truncated.any() for step in steps)
+
+
+@pytest.fixture(scope="module")
+def sinking(humanoid) -> ReferenceTable:
+    """0.5 m down in 2 s: neighbouring frames are 8 mm apart."""
+    clip = standing(humanoid, "sinking", 61, 0.0, 0.0)
+    clip.qpos[:, 2] -= np.linspace(0, 0.5, 61)
+    return ReferenceTable(ClipLibrary.of([clip]), control_hz=30)
+
+
+def placed(table, frame: int, **settings):
+    """A task and its environment of 4 rows exactly at a frame of the first clip."""
+    task, env, obs = roaming(table, 4, **settings)
+    rows, frames = np.arange(4), np.full(4, frame)
+    task.place(rows, np.zeros(4, int), frames)
+    env.sim.set_state(rows, table.qpos[frames], table.qvel[frames])
+    return task, env, obs
+
+
+def test_a_clip_is_not_entered_again_just_behind(sinking):
+    """The likest frames of all are those just passed, and a motion that went back to them would stutter."""
+    task, env, _ = placed(sinking, 60)
+    task.over(env.sim.state())
+    assert (task.landing == 60 - task.tail).all()
+    task, env, _ = placed(sinking, 59)
+    for _ in range(9):  # one step is left: every row looks for a frame with certainty
+        task.over(env.sim.state())
+        assert (task.landing == 59 - task.tail).all()
+
+
+def test_an_end_that_is_like_nothing_may_go_on_in_the_likest_frame(sinking):
+    task, env, _ = placed(sinking, 60, reach=0.0, reach_at_end=0.05)  # the likest is 17 mm away
+    terminated, over = task.over(env.sim.state())
+    assert not terminated.any() and not over.any() and (task.landing == 58).all()
+    for frame, reach in ((60, 0.01), (59, 0.05)):  # too far; not yet at the end
+        task, env, _ = placed(sinking, frame, reach=0.0, reach_at_end=reach)
+        _, over = task.over(env.sim.state())
+        assert (task.landing == -1).all() and over.all() == (frame == 60)
+
+
+def test_after_a_jump_the_error_counts_when_the_body_had_time_to_come_over(sinking):
+    task, env, obs = placed(sinking, 60, reach=0.0, reach_at_end=0.05)
+    task.over(env.sim.state())
+    task.land(env, obs)
+    far = env.sim.qpos.copy()
+    far[:3, 0] += 2.0
+    env.sim.set_state(np.arange(4), far, env.sim.qvel)
+    body = env.sim.state()
+    body.pos[2] = np.nan  # as in a simulation that blew up
+    failed = [task.over(body)[0] for _ in range(11)]
+    assert [step.tolist() for step in failed[:9]] == [[False, False, True, False]] * 9  # 0.3 s
+    assert [step.tolist() for step in failed[9:]] == [[True, True, True, False]] * 2
+    env.reset()
+    assert not task.over(env.sim.state())[0].any() and task.over(body)[0].all()  # a row that starts has no such time
 
 
 def test_transitions_happen_at_random_and_only_to_other_clips(humanoid):

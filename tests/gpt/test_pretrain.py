@@ -118,6 +118,8 @@ def test_other_settings_are_refused_by_name(tokenizer, clips, tmp_path):
         pretrain(tokenizer, clips, replace(SMALL, lr=0.1), tmp_path, threads=1, quiet=True)
     with pytest.raises(CheckpointError, match=r"tokens.safetensors: .*config.transitions: 1.0 -> 2.0"):
         pretrain(tokenizer, clips, replace(SMALL, transitions=2.0), tmp_path, threads=1, quiet=True)
+    with pytest.raises(CheckpointError, match=r"tokens.safetensors: .*config.reach_at_end: 0.25 -> 0.6"):
+        pretrain(tokenizer, clips, replace(SMALL, reach_at_end=0.6), tmp_path, threads=1, quiet=True)
     with pytest.raises(CheckpointError, match=r"clips: \['cycle', 'once'\] -> \['cycle'\]"):
         pretrain(tokenizer, clips[:1], SMALL, tmp_path, threads=1, quiet=True)
 

@@ -1,3 +1,4 @@
+import json
 import re
 from dataclasses import replace
 
@@ -6,9 +7,11 @@ import pytest
 import torch
 
 from kinetok.checkpoint import CheckpointError, load_artifact, load_state
+from kinetok.config import ConfigError
 from kinetok.logger import read_metrics
+from kinetok.motion.library import ClipLibrary
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers import distill as module
 from kinetok.tokenizers.distill import DistillStage, _View, distill
 from kinetok.tokenizers.fit import new_tokenizer
@@ -108,7 +111,7 @@ def test_a_teacher_sees_its_own_observation(small, standing, future):
         env.reset()
         action = standing.target[:6] + 0.2
         obs[window] = [torch.from_numpy(env.step(action).obs) for _ in range(4)]
-    view = _View(teacher, Tracking(TrackingConfig(future=small.tokenizer.future), standing, rows=6))
+    view = _View(teacher, Tracking(TrackingConfig(future=small.tokenizer.future), standing, rows=6), False)
     for student_sees, teacher_sees in zip(obs[small.tokenizer.future], obs[future], strict=True):
         assert torch.equal(student_sees[:, view.columns], teacher_sees)
         with torch.no_grad():
@@ -124,6 +127,47 @@ def test_every_clip_is_labelled_by_its_own_teacher(student, teachers, standing, 
         distill(pupil, order, standing, short, tmp_path / name, quiet=True)
         weights.append(pupil.state_dict())
     assert same(weights[0], weights[2]) and not same(weights[0], weights[1])
+
+
+def test_a_changed_teacher_is_refused(config, student, teachers, standing, tmp_path, cut_off):
+    def run(left, right):
+        parents = {"teacher/wave": left * 64, "teacher/sweep": right * 64}
+        distill(student, teachers, standing, config, tmp_path, parents=parents, quiet=True)
+
+    cut_off(module, 3, lambda: run("a", "b"))
+    message = (
+        f"state.safetensors: this run was made from other artifacts: teacher/sweep {'b' * 12} -> {'c' * 12}. Remove"
+    )
+    with pytest.raises(CheckpointError, match=re.escape(message)):
+        run("a", "c")
+    run("a", "b")
+    assert load_artifact(tmp_path).parents == {"teacher/wave": "a" * 64, "teacher/sweep": "b" * 64}
+
+
+def test_a_clip_that_always_fails_leaves_the_others_their_share(student, teachers, wave, config, tmp_path):
+    """The reference of the second clip is 9 m away: every episode there fails, of the first few do."""
+    calm = replace(config, samples=40 * 32, eval_every=40 * 32, fail_mean=0.4, env=EnvConfig(episode_seconds=0.2))
+    table = ReferenceTable(ClipLibrary.of([wave("wave"), wave("lost")]))
+    table.body.pos[table.first[1] :] += 9.0
+    distill(student, teachers, table, calm, tmp_path, quiet=True)
+    weights = json.loads(load_state(tmp_path / "state.safetensors")[1]["env"])["task"]["weights"]
+    assert weights[1] == pytest.approx(10**0.5) and weights[0] == pytest.approx(10**-0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "samples must be at least 1, not 0"),
+        ({"updates": 0}, "updates must be at least 1, not 0; without minibatches nothing is learned"),
+        ({"memory": 255}, "memory must be at least 256, not 255"),
+        ({"focus": 0.5}, "focus must be at least 1, not 0.5; 1 draws all clips alike"),
+        ({"noise": -0.1}, "noise must be at least 0, not -0.1"),
+        ({"fail_mean": -1.0}, "fail_mean must be above 0, not -1.0"),
+    ],
+)
+def test_a_stage_that_cannot_run_is_refused(change, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        DistillStage(**change)
 
 
 def far(small, standing) -> MotionTokenizer:

@@ -1,17 +1,28 @@
+import io
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
-from kinetok.checkpoint import CheckpointError, load_artifact
+from kinetok.checkpoint import CheckpointError, load_artifact, load_state
 from kinetok.config import ConfigError, override
 from kinetok.logger import read_metrics
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
+from kinetok.motion.library import ClipLibrary
 from kinetok.rl import training
 from kinetok.tokenizers import distill, train
-from kinetok.tokenizers.fit import fit, train_teachers
+from kinetok.tokenizers.fit import clip_table, fit, train_teachers
+from kinetok.tokenizers.tokenizer import MotionTokenizer
 
 BOX = """
 <mujoco model="box">
@@ -51,6 +62,8 @@ def test_every_stage_leaves_its_artifact(done):
     assert best.hash in {load_artifact(out / stage).hash for stage in ("distill", "ppo")}
     teachers = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in ("wave", "sweep")}
     assert load_artifact(out / "distill").parents == teachers
+    assert load_artifact(out / "ppo").parents == {"distill": load_artifact(out / "distill").hash} | teachers
+    assert load_artifact(out / "teachers" / "wave").parents == {}
 
 
 def test_cards_say_what_made_them(done):
@@ -77,6 +90,86 @@ def test_a_finished_fit_returns_at_once(done, clips, small, monkeypatch):
     monkeypatch.setattr(train, "track", fail)
     monkeypatch.setattr(distill, "track", fail)
     assert fit(clips, small, out, seed=0).hash == tokenizer.hash
+
+
+def test_it_ends_with_a_table_of_the_clips(done, clips, small, capsys):
+    out, _ = done
+    fit(clips, small, out, seed=0)
+    lines = capsys.readouterr().out.splitlines()
+    rows = [line.split() for line in lines if " % " in line]
+    assert {row[1] for row in rows} == {"wave", "sweep"}
+    score = load_state(out / "teachers" / "wave" / "state.safetensors")[1]["progress"]["score"]
+    wave = next(row for row in rows if row[1] == "wave")
+    assert wave[-5:] == [f"{100 * score['success'][0]:.0f}", "%", "│", f"{score['mpjpe_mm'][0]:.0f}", "│"]
+    assert lines[-1].startswith("best stage: ")
+
+
+def test_the_table_puts_the_hardest_clip_first_and_says_what_is_not_known():
+    student, teacher = np.array([[1, 30.4], [0.5, 99], [1, 40]]), np.array([[1, 20], [np.nan] * 2, [0, 9]])
+    console = Console(file=io.StringIO(), width=100)
+    console.print(clip_table(("a", "b", "c"), {"distill": student, "teacher": teacher}))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert "distill: success" in lines[1] and "teacher: success" in lines[1]
+    rows = ["".join(line.split()) for line in lines[3:-1]]
+    assert rows == ["│b│50%│99│-│-│", "│c│100%│40│0%│9│", "│a│100%│30│100%│20│"]
+
+
+SLEEPER = """
+import multiprocessing, sys, time
+from pathlib import Path
+
+def work(ready):
+    from kinetok.tokenizers.fit import begin_worker
+    begin_worker()
+    Path(ready).touch()
+    time.sleep(100)
+
+if __name__ == "__main__":
+    multiprocessing.get_context("spawn").Process(target=work, args=sys.argv[1:2]).start()
+"""
+TEACHERS = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from kinetok.motion.library import ClipLibrary
+from kinetok.presets import FIT
+from kinetok.tokenizers.fit import train_teachers
+
+if __name__ == "__main__":
+    ready, library, small = Path(sys.argv[1]), ClipLibrary.open(Path(sys.argv[2])), FIT["tiny"]()
+    endless = replace(small, workers=2, teacher=replace(small.teacher, samples=10**9))
+    train_teachers([library.clip(k) for k in range(2)], endless, ready.parent.parent, seed=0, threads=1)
+"""
+
+
+@pytest.mark.parametrize("script", [SLEEPER, pytest.param(TEACHERS, marks=pytest.mark.slow)], ids=["one", "teachers"])
+def test_workers_end_when_their_parent_is_killed(script, clips, tmp_path):
+    """Every process holds the pipe, so its end is the end of them all."""
+    ready, library, file = tmp_path / "wave" / "metrics.jsonl", tmp_path / "clips.safetensors", tmp_path / "run.py"
+    ready.parent.mkdir()
+    file.write_text(script)
+    ClipLibrary.write(library, clips)
+    command = [sys.executable, str(file), str(ready), str(library)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True) as parent:
+        try:
+            while not ready.exists() and parent.poll() is None:
+                time.sleep(0.05)
+            assert parent.poll() is None, parent.communicate()[0].decode()
+            parent.kill()
+            parent.communicate(timeout=10)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(parent.pid, signal.SIGKILL)
+
+
+def test_a_changed_teacher_is_refused_by_what_came_of_it(clips, small, tmp_path):
+    fit(clips[:1], small, tmp_path, seed=0)
+    teacher = MotionTokenizer.from_pretrained(tmp_path / "teachers/wave")
+    torch.nn.init.zeros_(teacher.decoder[-1].weight)
+    teacher.save_pretrained(tmp_path / "teachers/wave", "another")
+    before, after = load_artifact(tmp_path).parents["teacher/wave"], load_artifact(tmp_path / "teachers/wave").hash
+    with pytest.raises(CheckpointError, match=f"teacher/wave {before[:12]} -> {after[:12]}. Remove .*distill to make"):
+        fit(clips[:1], small, tmp_path, seed=0)
 
 
 def test_teachers_are_the_same_at_any_thread_count(done, clips, small, tmp_path):
@@ -110,6 +203,15 @@ def test_from_scratch_needs_no_teacher(clips, small, tmp_path):
     fit(clips[:1], replace(small, stages=("ppo",)), tmp_path / "out")
     assert not (tmp_path / "out" / "teachers").exists()
     assert "Stages: ppo." in (tmp_path / "out" / "README.md").read_text()
+    assert load_artifact(tmp_path / "out").parents == {}
+
+
+def test_settings_that_belong_together_come_in_any_order(small):
+    for order in (1, -1):
+        settings = ["teacher_tokenizer.future=1,9", "tokenizer.future=1,2,9", "ppo.env.scene.substeps=2"]
+        config = override(small, ["tokenizer.scene.substeps=2", *settings][::order])
+        assert config.teacher_tokenizer.future == (1, 9) and config.ppo.env.scene.substeps == 2
+    assert override(small, ["teacher_tokenizer.future=1,9", "stages=ppo"]).stages == ("ppo",)  # nobody labels
 
 
 def other_body(tmp_path) -> Clip:
@@ -137,6 +239,17 @@ def other_body(tmp_path) -> Clip:
             lambda clips, small, tmp_path: (clips, replace(small, stages=("teacher", "distil"))),
             ConfigError,
             "unknown stage 'distil'; did you mean 'distill'?; stages: teacher, distill, ppo",
+        ),
+        (lambda clips, small, tmp_path: (clips, override(small, ["stages=()"])), ConfigError, "stages is empty"),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["workers=0"])),
+            ConfigError,
+            "config: workers must be at least 1, not 0; 1 trains one teacher after the other",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["teacher.rows=0"])),
+            ConfigError,
+            "config.teacher: rows must be at least 1, not 0",
         ),
         (
             lambda clips, small, tmp_path: (clips, override(small, ["tokenizer.scalars=4"])),

@@ -29,5 +29,5 @@ def test_mirrored_worlds_stay_mirror_images(humanoid, walk):
 
 
 def test_a_character_whose_frames_are_no_images_is_refused():
-    with pytest.raises(ConfigError, match="'g1': observation .* has no mirror image"):
+    with pytest.raises(ConfigError, match=r"'g1': observation .* has no mirror image"):
         Mirror.of("g1", FUTURE)

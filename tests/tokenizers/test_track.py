@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,9 +77,32 @@ def test_pushes_are_felt_and_seeded(standing, good):
     assert once.to_json() == twice.to_json() != other.to_json()
 
 
+def test_a_clip_survives_relative_to_how_long_it_could_last(good):
+    """Halving what the short of two clips survives costs as much as halving the long one's: 0.2 * 0.5 / 2."""
+    both = replace(good, seconds=np.array([1.0, 20.0]), limit=np.array([1.0, 20.0]))
+    short, long = (replace(both, seconds=np.array(seconds)) for seconds in ([0.5, 20.0], [1.0, 10.0]))
+    assert both.merit - short.merit == pytest.approx(0.05) and both.merit - long.merit == pytest.approx(0.05)
+
+
+def test_the_limit_is_the_clips_end_or_the_seconds_of_a_loop(wave, good):
+    assert good.limit.tolist() == [1.0, 1.0]
+    table = ReferenceTable(ClipLibrary.of([wave("loop", loop=True), wave("once", 0.5)]), seconds=2)
+    limits = [track(Follow(28), table, future=(1,), episodes=2, seconds=s).limit.tolist() for s in (1.2, 9.0)]
+    # the loop's table ends after 3 s, entered at 0 and 0.5 s
+    assert limits == [[1.2, 0.5], [2.75, 0.5]]
+
+
+def test_a_score_from_before_limits_keeps_its_merit(good):
+    old = good.to_json() | {"seconds": [0.5, 2.0]}
+    del old["limit"]
+    again = TrackingScore.from_json(old)
+    expected = good.success.mean() + 0.2 * (0.25 + 1) / 2 - good.mpjpe_mm.mean() / 1000
+    assert again.limit.tolist() == [2.0, 2.0] and again.merit == pytest.approx(expected)
+
+
 def test_json_round_trip_is_exact(good):
     again = TrackingScore.from_json(json.loads(json.dumps(good.to_json())))
     assert again.names == good.names and again.episodes == good.episodes
-    for name in ("success", "success_mean_error", "mpjpe_mm", "seconds"):
+    for name in ("success", "success_mean_error", "mpjpe_mm", "seconds", "limit"):
         assert np.array_equal(getattr(again, name), getattr(good, name))
     assert again.merit == good.merit

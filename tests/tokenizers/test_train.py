@@ -157,6 +157,36 @@ def test_a_state_from_before_a_setting_existed_goes_on(whole, config, student, s
         train_ppo(student, standing, replace(config, patience=3), tmp_path, quiet=True)
 
 
+def test_parents_are_kept_and_a_state_made_from_others_is_refused(whole, config, student, standing, tmp_path, cut_off):
+    def run(parents):
+        train_ppo(student, standing, config, tmp_path / "out", parents=parents, quiet=True)
+
+    cut_off(train, 2, lambda: run({"distill": "a" * 64}))
+    assert load_artifact(tmp_path / "out").parents == {"distill": "a" * 64} and load_artifact(whole[0]).parents == {}
+    for parents, change in (({"distill": "b" * 64}, f"distill {'a' * 12} -> {'b' * 12}"), ({}, f"{'a' * 12} -> none")):
+        with pytest.raises(
+            CheckpointError, match=f"made from other artifacts: .*{change}. Remove .*out to make it anew"
+        ):
+            run(parents)
+    run({"distill": "a" * 64})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "samples must be at least 1, not 0; to leave the stage out, take its name from stages"),
+        ({"rows": 0}, "rows must be at least 1, not 0"),
+        ({"eval_every": 0}, "eval_every must be at least 1, not 0; give as many as samples"),
+        ({"eval_episodes": 0}, "eval_episodes must be at least 1, not 0"),
+        ({"critic_warmup": -1}, "critic_warmup must be at least 0, not -1; 0 is none"),
+        ({"fail_mean": 0.0}, "fail_mean must be above 0, not 0.0"),
+    ],
+)
+def test_a_stage_that_cannot_run_is_refused(change, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        PPOStage(**change)
+
+
 def test_a_loss_that_is_not_finite_stops_the_run(half, config, student, wave):
     table = ReferenceTable(ClipLibrary.of([wave("wave"), wave("sweep", reach=-0.8)]))
     table.body.linear[:] = np.nan  # the reward's velocity term is not a number
