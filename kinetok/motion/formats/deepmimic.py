@@ -126,7 +126,9 @@ def _to_qpos(path: Path, body: Character, values: np.ndarray) -> np.ndarray:
 def _resample(path: Path, body: Character, qpos: np.ndarray, times: np.ndarray, fps: float) -> np.ndarray:
     if times[-1] * fps > STRETCH * len(times):
         frame = int(np.diff(times).argmax())
-        raise FormatError(path, f"frame {frame}, column 0", f"{np.diff(times).max():g} s, where most take {1 / fps:g} s")
+        raise FormatError(
+            path, f"frame {frame}, column 0", f"{np.diff(times).max():g} s, where most take {1 / fps:g} s"
+        )
     wanted = np.arange(int(times[-1] * fps + 1e-6) + 1) / fps
     low = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(times) - 2)
     share = np.clip((wanted - times[low]) / (times[low + 1] - times[low]), 0, 1)
