@@ -137,6 +137,54 @@ def clips_info(paths: tuple[Path, ...]) -> None:
         )
 
 
+@clips.command("check")
+@click.argument("paths", nargs=-1, required=True, type=PATHS)
+@click.option("--fix", is_flag=True, help="Repair what has one right repair and write the rest with it; needs --out.")
+@click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
+@click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
+def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None) -> None:
+    """Look for what is wrong with motion: lead-ins, jumps, spikes, units, up axis, floor, duplicates.
+
+    What has one right repair is repaired by --fix (and by every command that reads recorded skeletons); the rest is
+    refused with its frame and joint. Exits with 1 where anything was refused.
+    """
+    from kinetok.motion.check import check, report
+    from kinetok.motion.duplicates import duplicates
+    from kinetok.motion.formats import read
+
+    if fix != (out is not None):
+        raise ValueError("--fix writes what it repairs: give both --fix and --out F.safetensors")
+    motions = [motion for path in paths for motion in read(path)]
+    refused = set()
+    for motion in motions:
+        findings = check(motion)
+        refused |= {motion.name} if any(f.severity == "refused" for f in findings) else set()
+        click.echo(f"{motion.name}\n  " + report(findings).replace("\n", "\n  "))
+    for pair in duplicates(motions):
+        part, whole = motions[pair.part].name, motions[pair.whole].name
+        click.echo(f"{part} is in {whole} from {pair.start:.2f} s on{', mirrored' if pair.mirrored else ''}")
+    if out is not None:
+        write_fixed(out, motions, refused, character)
+    if refused:
+        raise click.exceptions.Exit(1)
+
+
+def write_fixed(out: Path, motions: list, refused: set[str], character: str | None) -> None:
+    """A library of the motions that were not refused, mended."""
+    from kinetok.motion.check import mend
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.motion.retarget import retarget
+    from kinetok.motion.skeleton import SkeletonMotion
+
+    check_suffix(out, ".safetensors")
+    mended = [mend(motion)[0] for motion in motions if motion.name not in refused]
+    if not mended:
+        raise ValueError(f"--out {out}: every motion was refused, there is nothing to write")
+    fitted = [retarget(m, character or "humanoid").clip if isinstance(m, SkeletonMotion) else m for m in mended]
+    ClipLibrary.write(out, fitted)
+    click.echo(f"wrote {out}: {len(fitted)} clips; left out: {', '.join(sorted(refused)) or 'none'}")
+
+
 @clips.command("import")
 @click.argument("paths", nargs=-1, required=True, type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")

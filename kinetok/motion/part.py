@@ -73,7 +73,13 @@ class Part:
 
     def entries(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """starts, lengths, fps and loop (bool) of clips ids (N,)."""
-        found = self.starts[ids], self.lengths[ids], self.fps[ids], self.loop[ids].astype(bool)
+        starts, lengths, fps, loop = (
+            self._take(column, ids) for column in (self.starts, self.lengths, self.fps, self.loop)
+        )
+        return starts, lengths, fps, loop.astype(bool)
+
+    def _take(self, column: np.ndarray, ids: np.ndarray) -> np.ndarray:
+        found = column[ids]
         self.forget()
         return found
 
@@ -184,6 +190,7 @@ def write_part(
 def open_part(path: Path) -> Part:
     """One file as a part: the index mapped, the frames left where they are, everything checked but the frames."""
     file = path.open("rb")
+    os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
     header, base = _header(path, file)
     metadata = header.pop("__metadata__", None)
     if not isinstance(metadata, dict) or metadata.get("kind") != "clips":

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from kinetok.motion.check import mend
 from kinetok.motion.clip import Clip
 from kinetok.motion.error import FormatError
 from kinetok.motion.formats.amass import is_amass, read_amass, write_amass
@@ -87,8 +88,9 @@ def read(path: Path, *, fps: float | None = None) -> list[Clip | SkeletonMotion]
 
 
 def read_clips(path: Path, character: str | None = None, *, fps: float | None = None) -> list[Clip]:
-    """The motions of a path as clips. Recorded skeletons are retargeted to `character`, "humanoid" when None; clips of
-    a robot or of a library stay what they are, and one of another character than asked for is refused."""
+    """The motions of a path as clips. Recorded skeletons are mended (motion.check) and retargeted to `character`,
+    "humanoid" when None; clips of a robot or of a library stay what they are, and one of another character than asked
+    for is refused."""
     motions = [(file, motion) for file, known in _files(path) for motion in _read(file, known, fps)]
     return [_fit(file, motion, character) for file, motion in motions]
 
@@ -96,7 +98,7 @@ def read_clips(path: Path, character: str | None = None, *, fps: float | None = 
 def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Clip:
     if isinstance(motion, SkeletonMotion):
         try:
-            return retarget(motion, character or "humanoid").clip
+            return retarget(mend(motion)[0], character or "humanoid").clip
         except RigError as error:
             raise FormatError(path, "skeleton", str(error)) from None
     if character not in (None, motion.character):
