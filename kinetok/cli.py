@@ -139,7 +139,13 @@ def clips_info(paths: tuple[Path, ...]) -> None:
 
 @clips.command("check")
 @click.argument("paths", nargs=-1, required=True, type=PATHS)
-@click.option("--fix", is_flag=True, help="Repair what has one right repair and write the rest with it; needs --out.")
+@click.option(
+    "--fix",
+    is_flag=True,
+    default=False,
+    show_default=True,
+    help="Repair what has one right repair and write the rest with it; needs --out.",
+)
 @click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
 @click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
 def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None) -> None:

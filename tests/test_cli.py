@@ -124,6 +124,17 @@ def test_help_loads_no_torch(args):
     subprocess.run([sys.executable, "-c", code, *args], check=True, capture_output=True, cwd=Path(__file__).parents[1])
 
 
+def test_clips_check_tells_repairs_and_refuses(data_dir, tmp_path):
+    good, bad = (data_dir / "bvh" / "cmu_daz" / f"cmu_{name}.bvh" for name in ("02_01", "05_03"))
+    told = kinetok("clips", "check", good)
+    assert told.exit_code == 0 and "6 frames dropped" in told.output
+    mixed = kinetok("clips", "check", good, bad, "--fix", "--out", tmp_path / "fixed.safetensors")
+    assert mixed.exit_code == 1 and "left out: cmu_05_03" in mixed.output
+    assert [clip.name for clip in read_clips(tmp_path / "fixed.safetensors")] == ["cmu_02_01"]
+    lone = kinetok("clips", "check", good, "--fix")
+    assert lone.exit_code == 1 and "give both --fix and --out" in lone.output
+
+
 def test_clips_info_says_what_a_file_holds(clip):
     result = kinetok("clips", "info", clip)
     header, row = result.output.splitlines()

@@ -190,7 +190,6 @@ def write_part(
 def open_part(path: Path) -> Part:
     """One file as a part: the index mapped, the frames left where they are, everything checked but the frames."""
     file = path.open("rb")
-    os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
     header, base = _header(path, file)
     metadata = header.pop("__metadata__", None)
     if not isinstance(metadata, dict) or metadata.get("kind") != "clips":
