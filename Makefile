@@ -1,4 +1,4 @@
-.PHONY: demo check test slow bench
+.PHONY: demo check test slow fuzz bench
 
 demo:
 	kinetok demo
@@ -11,6 +11,9 @@ test:
 
 slow:
 	pytest -m slow
+
+fuzz:
+	KINETOK_FUZZ=100000 pytest -m slow -s tests/motion/formats/test_fuzz.py
 
 bench:
 	python benchmarks/run.py
