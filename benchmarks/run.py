@@ -24,6 +24,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+from library import library  # benchmarks/library.py
 from mujoco.batch import Batch
 
 from kinetok import presets
@@ -150,19 +151,24 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help=f"which to run: {', '.join(BENCHMARKS)}; all when none is named")
     parser.add_argument("--json", type=Path, help="also write the results to this file")
     parser.add_argument("--clip", type=Path, default=CLIP, help="a DeepMimic walk")
+    parser.add_argument("--scratch", type=Path, help="a folder with room for a library of --hours, for `library`")
+    parser.add_argument("--hours", type=float, nargs="+", default=[1, 10], help="sizes of that library; 680 are 6.8 GB")
     options = parser.parse_args()
-    unknown = set(options.names) - set(BENCHMARKS)
+    table = dict(BENCHMARKS)
+    if options.scratch:
+        table["library"] = lambda _: library(options.scratch, options.hours)
+    unknown = set(options.names) - set(table)
     if unknown:
-        parser.error(f"unknown benchmark {sorted(unknown)}; there are: {', '.join(BENCHMARKS)}")
+        parser.error(f"unknown benchmark {sorted(unknown)}; there are: {', '.join(table)}, and library with --scratch")
     if not options.clip.exists():
         raise SystemExit(f"skipped: no clip at {options.clip}; give a DeepMimic walk with --clip")
-    names = options.names or list(BENCHMARKS)
+    names = options.names or list(table)
     results: dict[str, object] = {
         "machine": {"cpus": os.cpu_count(), "load": os.getloadavg()[0], "python": platform.python_version()},
         "mujoco": mujoco.__version__,
     }
     for name in names:
-        figures = BENCHMARKS[name](options.clip)
+        figures = table[name](options.clip)
         print(f"{name}: {json.dumps(figures, indent=2)}")
         results |= figures if len(names) == 1 else {name: figures}
     if options.json:

@@ -148,7 +148,8 @@ def clips_info(paths: tuple[Path, ...]) -> None:
 )
 @click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
 @click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
-def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None) -> None:
+@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
+def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, fps: float | None) -> None:
     """Look for what is wrong with motion: lead-ins, jumps, spikes, units, up axis, floor, duplicates.
 
     What has one right repair is repaired by --fix (and by every command that reads recorded skeletons); the rest is
@@ -160,7 +161,7 @@ def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character:
 
     if fix != (out is not None):
         raise ValueError("--fix writes what it repairs: give both --fix and --out F.safetensors")
-    motions = [motion for path in paths for motion in read(path)]
+    motions = [motion for path in paths for motion in read(path, fps=fps)]
     refused = set()
     for motion in motions:
         findings = check(motion)
