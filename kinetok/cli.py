@@ -440,7 +440,7 @@ def finetune(prior, task, adapter, method, paths, start, out, preset, settings, 
     """Bend the frozen prior to a task with a small adapter: by reward (rl), by examples (sft), or one after the other.
 
     \b
-    Presets: laptop (an hour or two on two cores), paper (GPC's sizes), tiny (tests).
+    Presets: laptop (2 million steps on two cores), paper (GPC's sizes), tiny (tests).
     kinetok finetune --task target --out runs/target
     kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
     kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further

@@ -121,7 +121,7 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """A task in an hour or two on two cores."""
+    """Two million control steps; no run of it has learned its task yet (docs/log.md)."""
     return FinetuneConfig()
 
 

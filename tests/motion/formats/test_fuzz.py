@@ -261,6 +261,7 @@ def spoil_part(data: bytes, where: float, what: int) -> bytes:
                 place = where if what % 3 else where * min(128 / max(len(content), 1), 1)  # a header is short
                 new.writestr(name, change(content, place, what // 4) if name == chosen else content)
     except (zipfile.BadZipFile, ValueError, IndexError, OSError, EOFError, NotImplementedError):
+        # An earlier mutation has broken the archive itself: mutate its bytes instead.
         return spoil_bytes(data, where, what)
     return file.getvalue()
 
