@@ -212,6 +212,31 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
     click.echo(f"wrote {out}: {len(found)} clips, {sum(c.seconds for c in found):.1f} s")
 
 
+@clips.command("vary")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+@click.option("--seconds", default=60.0, show_default=True, help="Length of the motion.")
+@click.option("--turn", default=60.0, show_default=True, help="Degrees per second it turns at most, to either side.")
+@click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
+@click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
+@option_seed
+def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, seed) -> None:
+    """Make one long motion of a gait cycle: turning, hurrying, lingering, halting.
+
+    \b
+    A prior of straight walks has nothing to choose from; one of varied walks can be steered.
+    kinetok clips vary walk.txt --halt 6 --out walk-varied.safetensors
+    """
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.motion.vary import vary
+
+    check_suffix(out, ".safetensors")
+    varied = vary(one_clip(source, name), seconds=seconds, turn=turn, tempo=tempo, halt=halt, seed=seed)
+    ClipLibrary.write(out, [varied])
+    click.echo(f"wrote {out}: {varied.name}, {varied.seconds:.1f} s")
+
+
 @clips.command("export")
 @click.argument("source", type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="File to write: .bvh, .csv (robot) or .npz (AMASS-like).")

@@ -9,12 +9,11 @@ the reference, so the states are those the decoder itself produces; pushes and n
 them. Clips are drawn half of the time each as often as any other, half of the time by their duration, whatever
 the tracker fails at. The last half second before a failure is left out.
 
-`Roaming` joins the clips into one endless motion. Physics on a flat floor does not change when the world is
-shifted and turned, so a row goes on in another clip by having its own root moved to a frame of that clip which
-it resembles already. This happens at random (`transitions` per second) and, wherever a like frame exists,
-before a clip ends: the prior learns what follows an end, and how to change from one clip to another. Where a clip
-ends and no frame is like it, the motion may go on in the likest frame further away (`reach_at_end`): the reference
-jumps, the body does not, and the tracker pulls it over. What it does then is kept unless it fails.
+The clips are joined into one endless motion (sim.tasks.roaming): a row changes to another clip at random
+(`transitions` per second) and, wherever a like frame exists, before a clip ends, so that the prior learns what
+follows an end, and how to change from one clip to another. Where a clip ends and no frame is like it, the motion may
+go on in the likest frame further away (`reach_at_end`): the reference jumps, the body does not, and the tracker
+pulls it over. What it does then is kept unless it fails.
 """
 
 from dataclasses import dataclass, field
@@ -26,21 +25,17 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from kinetok import rotation
 from kinetok.checkpoint import load_state, save_state
 from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
-from kinetok.sim import observe
-from kinetok.sim.batch import BodyState
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.reset import ClipWeights
+from kinetok.sim.tasks.roaming import REACH, Roaming
+from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.train import in_scene
 
-BEFORE_FAILURE = 0.5  # seconds
-REACH = 0.25  # metres of `likeness`; walk to run, or the end of a jump to standing, is about 0.2
-GRACE = 0.3  # seconds for the body to come over to a reference that jumped; less than BEFORE_FAILURE, see `Roaming`
-GLANCE = 0.1  # seconds; a velocity difference counts as the distance it makes in this time
+BEFORE_FAILURE = 0.5  # seconds; more than roaming.GRACE, so that what a landing spoiled is left out
 STARTS = 512
 
 
@@ -105,122 +100,6 @@ class TokenDataset:
         return cls(**parts, names=tuple(meta["names"]), starts=Starts.of(tensors)), meta["meta"]
 
 
-class Roaming(Tracking):
-    """Tracking that goes on in another clip, `transitions` times per second on average and where a clip ends.
-
-    `over` leaves the frame at which each row is to go on in `landing` (rows,), -1 for most; `land` moves it there.
-    A clip's last `tail` steps, in which the window ahead begins to stand still, are left at a moment drawn
-    uniformly. A row whose clip is over and that resembles no frame within `reach` goes on in the likest frame of all
-    within `reach_at_end`, and without one it is truncated, as in Tracking. After such a jump no error is a failure for
-    GRACE; one that is still too large then is, so that the samples since the jump are among those before a failure.
-    """
-
-    def __init__(
-        self,
-        config: TrackingConfig,
-        table: ReferenceTable,
-        *,
-        rows: int,
-        transitions: float,
-        rng: np.random.Generator,
-        reach: float = REACH,
-        reach_at_end: float = REACH,
-    ):
-        super().__init__(config, table, rows=rows)
-        self.weights.values = clip_weights(table)
-        self.landing = np.full(rows, -1)
-        self.tail, self._rng, self._reach, self._reach_at_end = max(config.future), rng, reach, reach_at_end
-        self._grace = np.zeros(rows, int)  # steps left in which no error is a failure
-        self._jumps = np.zeros(rows, bool)  # whether `landing` is further than `reach`
-        self._chance = transitions / table.control_hz
-        # A clip is entered at any phase of its first cycle, or where at least a tail or half of it is left.
-        span = table.last - table.first
-        latest = np.where(span > table.cycle, table.cycle - 1, np.maximum(span - self.tail, span // 2))
-        self._entries = np.concatenate([np.arange(a, a + b + 1) for a, b in zip(table.first, latest, strict=True)])
-        self._edges = np.cumsum(latest + 1) - (latest + 1)
-        self._owner = np.repeat(np.arange(len(table.names)), latest + 1)
-        self._features = likeness(table.body.rows(self._entries))
-
-    def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        self.landing[ids], self._grace[ids] = -1, 0
-        return super().start(ids, rng)
-
-    def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
-        terminated, over = super().over(body)
-        terminated &= (self._grace == 0) | ~np.isfinite(self.error).all(1)
-        self._grace = np.maximum(self._grace - 1, 0)
-        left = self.table.last[self.clip] - self.frame
-        chance = np.where(left <= self.tail, 1 / np.maximum(left, 1), self._chance)
-        seeking = np.flatnonzero((self._rng.random(len(left)) < chance) & ~terminated)
-        self.landing[:], self._jumps[:] = -1, False
-        if len(seeking):
-            self.landing[seeking], self._jumps[seeking] = self._nearest(body.rows(seeking), seeking, left[seeking])
-        return terminated, over & (self.landing < 0)
-
-    def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
-        """The weights of the clips stay as they are: this task records, it does not train."""
-
-    def land(self, env: Env, obs: np.ndarray) -> None:
-        """Move the rows of env that `landing` names into their new clips; obs (N, O) is renewed in place."""
-        ids = np.flatnonzero(self.landing >= 0)
-        if not len(ids):
-            return
-        frame = self.landing[ids]
-        self.place(ids, np.searchsorted(self.table.first, frame, side="right") - 1, frame)
-        self._grace[ids] = np.where(self._jumps[ids], round(GRACE * self.table.control_hz), 0)
-        self.landing[ids] = -1
-        place = self.table.root[frame, :2], self.table.heading[frame]
-        env.sim.set_state(ids, *moved(env.sim.qpos[ids], env.sim.qvel[ids], *place))
-        obs[ids] = self.observe(env.sim.state(ids), ids)
-
-    def _nearest(self, body: BodyState, ids: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where rows ids with `left` (k,) steps of their clip may go on, frames (k,) or -1, and whether it is a jump.
-
-        The likest frame in a random one of the clips within reach; where the clip is over and none is within reach,
-        the likest of all within reach_at_end. Of its own clip, only in the tail, and only what is a tail or more ago:
-        the frames just behind are always the likest, and the motion would stutter.
-        """
-        own = likeness(body)
-        squares = (own**2).sum(1)[:, None] + (self._features**2).sum(1) - 2 * own @ self._features.T
-        latest = np.where(left <= self.tail, self.frame[ids] - self.tail, -1)
-        squares[(self._owner == self.clip[ids, None]) & (self._entries > latest[:, None])] = np.inf
-        best = np.minimum.reduceat(squares, self._edges, axis=1)
-        near = best < self._reach**2
-        chosen = np.where(near, self._rng.random(near.shape), -1).argmax(1)
-        jumps = ~near.any(1) & (left <= 0) & (best.min(1) < self._reach_at_end**2)
-        chosen[jumps] = best[jumps].argmin(1)
-        stop = np.append(self._edges[1:], len(self._entries))
-        frame = np.full(len(ids), -1)
-        for row in np.flatnonzero(near.any(1) | jumps):
-            first = self._edges[chosen[row]]
-            frame[row] = self._entries[first + squares[row, first : stop[chosen[row]]].argmin()]
-        return frame, jumps
-
-
-def likeness(body: BodyState) -> np.ndarray:
-    """Features (N, F) whose distance is that of two states in metres, blind to place and heading: root height,
-    and the root mean squares over bodies of the relative positions and of GLANCE times the velocities."""
-    state, bodies = observe.state_features(body), body.pos.shape[1]
-    pos = state[:, 1 : 1 + (bodies - 1) * 3]
-    linear = state[:, 1 + (bodies - 1) * 3 + bodies * 6 : 1 + (bodies - 1) * 3 + bodies * 9]
-    return np.concatenate([state[:, :1], pos / bodies**0.5, linear * (GLANCE / bodies**0.5)], axis=1)
-
-
-def moved(qpos: np.ndarray, qvel: np.ndarray, xy: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same states (n, nq), (n, nv) with the root at xy (n, 2) and turned to heading (n,).
-
-    Physics cannot tell, but for the scene's friction pyramid, whose corners keep their directions in the world.
-
-    Of a free joint's velocity the linear part is in the world frame and turns along, the angular part is local.
-    """
-    qpos, qvel = qpos.copy(), qvel.copy()
-    angle = heading - rotation.heading(qpos[:, 3:7])
-    qpos[:, :2] = xy
-    qpos[:, 3:7] = rotation.multiply(rotation.about_z(angle), qpos[:, 3:7])
-    qvel[:, :3] = rotation.turn(qvel[:, :3], np.cos(angle), np.sin(angle))
-    return qpos, qvel
-
-
 def clip_weights(table: ReferenceTable) -> np.ndarray:
     """How often each clip (K,) is drawn: half uniformly, half by duration; the sum is 1."""
     return 0.5 / len(table.names) + 0.5 * table.cycle / table.cycle.sum()
@@ -275,6 +154,8 @@ def record(
     rng = np.random.default_rng([seed, 1])
     tracking = TrackingConfig(future=tokenizer.config.future)
     task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng, reach_at_end=reach_at_end)
+    task.weights = ClipWeights(len(table.names), rate=1.0, bounds=(0.0, np.inf))  # whatever fails
+    task.weights.values = clip_weights(table)
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part = -(-samples // rows), task.layout["state"]
     states = torch.empty(steps, rows, part.stop - part.start)

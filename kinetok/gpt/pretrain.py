@@ -27,7 +27,7 @@ from torch import Tensor
 from kinetok.checkpoint import CheckpointError, flatten, load_artifact, load_state, save_state, unflatten
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, noted_path
-from kinetok.gpt.data import REACH, TokenDataset, record
+from kinetok.gpt.data import TokenDataset, record
 from kinetok.gpt.model import GPT, GPTConfig
 from kinetok.gpt.refine import RefineConfig, refine
 from kinetok.logger import Logger
@@ -35,6 +35,7 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import EnvConfig
+from kinetok.sim.tasks.roaming import REACH
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.layout import TokenLayout
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -51,7 +52,7 @@ class PretrainConfig:
     """width, layers, heads, head, head_width, dropout: of the GPT (see GPTConfig).
 
     samples: control steps to record. rows: worlds that record. transitions: changes of clip per second. code_noise:
-    share of scalars whose executed code is one level off. reach_at_end: how far, in metres of gpt.data's likeness, a
+    share of scalars whose executed code is one level off. reach_at_end: how far, in metres of roaming.likeness, a
     motion may jump where its clip ends and nothing nearer follows. env: pushes, noise and episodes of the recording.
     iterations of batch samples; lr falls by a cosine to lr_end after warmup iterations. weight_decay: of matrices.
     label_smoothing. ema: factor of the averaged weights. state_noise: standard deviations. held_out: share of worlds.

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import refuse_changed
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
+from kinetok.sim.tasks.roaming import REACH, Roaming
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.symmetry import Mirror
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -35,7 +37,9 @@ class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; noise: radians added to the student's targets while it acts; focus: how many times as
     often the clip that fails most may be drawn as the one that fails least; save_every: samples
-    between states to resume from, at the next evaluation (the memory starts anew there, so not too often).
+    between states to resume from, at the next evaluation (the memory starts anew there, so not too often);
+    transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
+    reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
 
     A clip that its own teacher cannot follow fails for ever, and takes its share for nothing: of K clips, one such
     leaves (K - 1) / (K - 1 + focus) of the states to the others: of 20 clips 2/3 with a focus of 10."""
@@ -50,6 +54,8 @@ class DistillStage:
     noise: float = 0.02
     fail_mean: float = 0.3
     focus: float = 10.0
+    transitions: float = 0.0
+    reach_at_end: float = REACH
     eval_every: int = 50_000
     eval_episodes: int = 16
     save_every: int = 400_000
@@ -90,7 +96,11 @@ def distill(
     if len(teachers) != len(table.names):
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
-    task = Tracking(TrackingConfig(future=future, fail_mean=config.fail_mean), table, rows=config.rows)
+    tracking = TrackingConfig(future=future, fail_mean=config.fail_mean)
+    task = Tracking(tracking, table, rows=config.rows)
+    if config.transitions:
+        rng, rate = np.random.default_rng([seed, 1]), config.transitions
+        task = Roaming(tracking, table, rows=config.rows, transitions=rate, rng=rng, reach_at_end=config.reach_at_end)
     task.weights = ClipWeights(len(table.names), bounds=(config.focus**-0.5, config.focus**0.5))
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     flags = mirrored or [False] * len(teachers)
@@ -130,7 +140,10 @@ def distill(
                 if float(student.norm.count) < 1_000_000:
                     student.observe(obs)
                 action += config.noise * torch.randn(action.shape, generator=generator)
-                obs = torch.from_numpy(env.step(action.numpy()).obs)
+                seen = env.step(action.numpy()).obs
+                if isinstance(task, Roaming):
+                    task.land(env, seen)
+                obs = torch.from_numpy(seen)
             for group in optimizer.param_groups:
                 group["lr"] = config.lr + (config.lr_end - config.lr) * step / total
             loss = torch.zeros(())

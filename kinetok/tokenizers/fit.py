@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kinetok.checkpoint import load_artifact, load_state, refuse_foreign, save_artifact
-from kinetok.config import ConfigError, at_least, nearest, to_dict
+from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.ppo import PPOConfig
@@ -40,7 +40,15 @@ from kinetok.tokenizers.distill import DistillStage, distill
 from kinetok.tokenizers.quantizer import ContinuousConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore
-from kinetok.tokenizers.train import KINDS, PPOStage, good_enough, identify, in_scene, train_ppo
+from kinetok.tokenizers.train import (
+    KINDS,
+    PPOStage,
+    good_enough,
+    identify,
+    in_scene,
+    refuse_other_parents,
+    train_ppo,
+)
 
 STAGES = ("teacher", "distill", "ppo")
 
@@ -71,7 +79,8 @@ def _polish() -> PPOStage:
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
     """stages; tokenizer: the student; teacher_tokenizer: its experts; the three stages' own settings; mirror: the
-    student learns every clip's mirror image too, from the same teacher; workers:
+    student learns every clip's mirror image too, from the same teacher; teacher_start: artifact directory of a teacher
+    whose weights every new one begins with, or a folder of such directories by the names of clips; workers:
     teachers that train at once."""
 
     stages: tuple[str, ...] = STAGES
@@ -81,6 +90,7 @@ class FitConfig:
     distill: DistillStage = DistillStage()
     ppo: PPOStage = field(default_factory=_polish)
     mirror: bool = False
+    teacher_start: str = ""
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -226,7 +236,11 @@ def _taught_numbers(folder: Path, names: Sequence[str], teachers: int) -> np.nda
 
 def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
     """One expert per clip, `config.workers` at a time on one core each; finished ones are left alone."""
-    jobs = [(clip, config, out / clip.name, seed) for clip in clips if not _taught(clip, config, out / clip.name, seed)]
+    jobs = [
+        (clip, _others(clip, clips, config), config, out / clip.name, seed)
+        for clip in clips
+        if not _taught(clip, _others(clip, clips, config), config, out / clip.name, seed)
+    ]
     if len(jobs) <= 1 or config.workers <= 1:
         # Sums of a network depend on its threads: one for each of many teachers, as in the pool.
         with torch_threads(torch.get_num_threads() if len(clips) == 1 else 1):
@@ -241,6 +255,11 @@ def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed:
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _others(clip: Clip, clips: Sequence[Clip], config: FitConfig) -> list[Clip]:
+    """Every other clip, and with `mirror` every mirror image."""
+    return [other for other in clips if other is not clip] + [other.mirror() for other in clips if config.mirror]
 
 
 def begin_worker() -> None:
@@ -262,13 +281,17 @@ def _report(running: dict, total: int) -> None:
         print(f"teacher {count}/{total} {running[future]}: {future.result()}", flush=True)
 
 
-def _taught(clip: Clip, config: FitConfig, out: Path, seed: int) -> bool:
+def _taught(clip: Clip, others: Sequence[Clip], config: FitConfig, out: Path, seed: int) -> bool:
     """Whether the teacher in `out` is finished; refuses one that was trained otherwise."""
     state = out / "state.safetensors"
     if not state.exists():
         return False
     meta = load_state(state)[1]
+    parents = _start(config, clip.name)[1]
+    refuse_other_parents(state, parents)
     identity = identify(config.teacher, _settings(config), [clip.name], seed)
+    identity |= {"parents": parents} if parents else {}
+    identity |= {"others": [other.name for other in others] or [clip.name]} if config.teacher.arrivals else {}
     refuse_changed(state, meta["identity"], identity, KINDS | {"stage": PPOStage})
     progress = Progress(**meta["progress"])
     return progress.samples >= config.teacher.samples or good_enough(progress, config.teacher)
@@ -279,10 +302,36 @@ def _settings(config: FitConfig) -> TokenizerConfig:
     return replace(config.teacher_tokenizer, character=config.tokenizer.character, scene=config.tokenizer.scene)
 
 
-def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool) -> str:
+def _start(config: FitConfig, name: str) -> tuple[MotionTokenizer | None, dict[str, str]]:
+    """The teacher that the one of clip `name` begins with, and its hash by role; nothing where there is none."""
+    path = Path(config.teacher_start)
+    if not config.teacher_start:
+        return None, {}
+    if not (path / "config.json").exists():
+        if not path.is_dir():
+            raise ConfigError(f"teacher_start {path}: no such directory; give a teacher's, or a folder of them")
+        path /= name
+        if not path.exists():
+            return None, {}
+    start = MotionTokenizer.from_pretrained(path)
+    changed = diff(to_dict(_settings(config)), to_dict(start.config))
+    if changed:
+        raise ConfigError(f"teacher_start {path} is of another shape: {'; '.join(changed)}")
+    return start, {"start": start.hash}
+
+
+def _teach(
+    clip: Clip, others: Sequence[Clip], config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool
+) -> str:
+    """Train the teacher of one clip. others: clips that it may have to go on from."""
     settings = _settings(config)
     table = ReferenceTable(ClipLibrary.of([clip]), control_hz=settings.scene.control_hz)
-    teacher = new_tokenizer(settings, table, seed)
+    origins = None
+    if config.teacher.arrivals and others:
+        origins = ReferenceTable(ClipLibrary.of(others), control_hz=settings.scene.control_hz)
+    teacher, (start, parents) = new_tokenizer(settings, table, seed), _start(config, clip.name)
+    if start is not None:
+        teacher.load_state_dict(start.state_dict())
     score = train_ppo(
         teacher,
         table,
@@ -292,6 +341,8 @@ def _teach(clip: Clip, config: FitConfig, out: Path, seed: int, *, threads: int,
         threads=threads,
         title=f"teacher {clip.name}",
         card=lambda score: tokenizer_card(teacher, [clip.name], "teacher", seed, score),
+        parents=parents,
+        others=origins,
         quiet=quiet,
     )
     return f"success {score.success.mean():.2f}, {score.mpjpe_mm.mean():.0f} mm"

@@ -25,6 +25,7 @@ from kinetok.rl.training import Progress, Training
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reward import TrackingReward
 from kinetok.sim.scene import SceneConfig
+from kinetok.sim.tasks.roaming import Arriving
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore, track
@@ -43,7 +44,9 @@ class PPOStage:
     episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; patience: or when, with
     stop_success reached, the best score is so many evaluations old; critic_warmup: first
     iterations that leave the policy alone; log_std: spread of the actions at the first and the last iteration;
-    anchor: pull towards the policy it started from; fail_mean: training's termination, metres of mean body error."""
+    anchor: pull towards the policy it started from; fail_mean: training's termination, metres of mean body error;
+    arrivals: share of the episodes that begin in a state of another clip, within `reach` metres of roaming.likeness, so
+    that motions can go over into one another."""
 
     samples: int = 2_000_000
     rows: int = 512
@@ -57,6 +60,8 @@ class PPOStage:
     log_std: tuple[float, float] = (-2.6, -2.9)
     anchor: float = 0.0
     fail_mean: float = 0.3
+    arrivals: float = 0.0
+    reach: float = 0.4
     reward: TrackingReward = TrackingReward()
     env: EnvConfig = EnvConfig()
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -66,6 +71,8 @@ class PPOStage:
         at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
         if not self.fail_mean > 0:
             raise ConfigError(f"fail_mean must be above 0, not {self.fail_mean}; its unit is metres of mean body error")
+        if not (0 <= self.arrivals <= 1 and self.reach > 0):
+            raise ConfigError(f"arrivals is a share and reach above 0 m, not {self.arrivals} and {self.reach}")
 
 
 def train_ppo(
@@ -79,18 +86,24 @@ def train_ppo(
     title: str = "ppo",
     card: Callable[[TrackingScore], str] = lambda score: "",
     parents: dict[str, str] | None = None,
+    others: ReferenceTable | None = None,
     quiet: bool = False,
 ) -> TrackingScore:
     """Train `actor` in place; returns the score of the best artifact, which lies in `out`.
 
-    parents: hashes of what the actor was made from, kept in the artifact; a state that had others is refused.
+    others: clips to arrive from, see `arrivals`; by default the table's own. parents: hashes of what the actor was
+    made from, kept in the artifact; a state that had others is refused.
     """
     identity = identify(config, actor.config, table.names, seed) | ({"parents": parents} if parents else {})
     refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
-    task = Tracking(
-        TrackingConfig(future=future, fail_mean=config.fail_mean, reward=config.reward), table, rows=config.rows
-    )
+    tracking = TrackingConfig(future=future, fail_mean=config.fail_mean, reward=config.reward)
+    task = Tracking(tracking, table, rows=config.rows)
+    if config.arrivals:
+        origins = others or table
+        share, reach = config.arrivals, config.reach
+        task = Arriving(tracking, table, origins, rows=config.rows, share=share, reach=reach)
+        identity |= {"others": list(origins.names)}
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     torch.manual_seed(seed)
     critic = Critic(env.obs_size, config.critic, actor.config.activation)

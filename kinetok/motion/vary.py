@@ -1,0 +1,137 @@
+"""Variations of a gait: turn where it went straight, hurry, linger, halt and go on.
+
+    clip = vary(walk, seconds=60, turn=60, tempo=1.2, halt=6, seed=0)      # one long motion, no longer a loop
+
+A recorded walk cycle goes one way at one speed; a prior that saw no other has nothing to choose from. Three changes
+keep a motion near to what a body can do, and physics does the rest when it is tracked:
+
+- turn     the path is bent by a yaw rate that wanders; the body leans into it by atan(v * rate / g) about its feet
+- tempo    the motion plays faster and slower by a factor that wanders
+- halt     it comes to rest where both feet are on the floor and hardly move, stays a while, and goes on
+
+Nothing here simulates: the result is a reference, to be tracked like any other. Where the feet stand, a bent path drags
+them along an arc, a few centimetres a step; a simulated body cannot follow that, which is its error and its repair.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from kinetok import rotation
+from kinetok.motion.character import Character
+from kinetok.motion.clip import Clip
+from kinetok.motion.kinematics import kinematics
+
+VARIED = "-varied"
+FPS = 60.0
+WANDER = 1.5  # seconds from one random value of turn or tempo to the next
+RAMP = 0.5  # seconds to stop or to start
+STAY = (0.5, 2.5)  # seconds a halt lasts
+QUIET = 0.7  # m/s: the fastest foot of a moment at which a body can halt
+GRAVITY = 9.81
+
+
+def vary(
+    clip: Clip, *, seconds: float = 60.0, turn: float = 60.0, tempo: float = 1.2, halt: float = 0.0, seed: int = 0
+) -> Clip:
+    """A motion of `seconds` made of a clip that begins and ends alike, or of as much of another one as there is.
+
+    turn: degrees per second the path turns at most, to either side. tempo: it plays so many times as fast or slow at
+    most. halt: seconds of moving between two halts on average; 0 for none. The same seed gives the same motion.
+    Raises ValueError for a motion that has no moment to halt at, naming its fastest foot.
+    """
+    if not (seconds > 0 and turn >= 0 and tempo >= 1 and halt >= 0):
+        raise ValueError(
+            f"clip {clip.name!r}: seconds must be above 0, turn and halt not below 0, tempo at least 1; "
+            f"not {seconds}, {turn}, {halt}, {tempo}"
+        )
+    rng, steps = np.random.default_rng(seed), round(seconds * FPS)
+    bent, speed = _wander(rng, steps) * np.radians(turn), tempo ** _wander(rng, steps)
+    phase = _play(speed, _quiet(clip) if halt else np.empty(0), halt, rng, clip)
+    if not clip.loop:
+        phase = phase[: np.searchsorted(phase, clip.seconds)]
+        if len(phase) < 2:
+            raise ValueError(f"clip {clip.name!r}: {clip.seconds:.2f} s are too short to vary")
+    qpos = clip.at(phase)
+    rate = np.diff(phase, append=2 * phase[-1] - phase[-2]) * FPS
+    return replace(
+        clip, name=clip.name + VARIED, fps=FPS, qpos=_bend(qpos, bent[: len(qpos)] * rate), loop=False,
+        source=f"{clip.source}, varied by turn {turn:g} deg/s, tempo {tempo:g}, halt {halt:g} s, seed {seed}",
+    )  # fmt: skip
+
+
+def _wander(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """A smooth random signal (steps,) within [-1, 1]: cosines from one random value to the next."""
+    every = round(WANDER * FPS)
+    knots = rng.uniform(-1, 1, steps // every + 2)
+    index, share = np.divmod(np.arange(steps), every)
+    share = (1 - np.cos(np.pi * share / every)) / 2
+    return knots[index] + (knots[index + 1] - knots[index]) * share
+
+
+def _quiet(clip: Clip) -> np.ndarray:
+    """Times (K,) within the clip at which its fastest foot is slowest, where that is slow enough to halt."""
+    body = Character.load(clip.character)
+    times = np.arange(0, clip.seconds, 1 / FPS)
+    motion = kinematics(body, clip.at(times), FPS)
+    fastest = np.linalg.norm(motion.linear[:, body.bodies("feet")], axis=-1).max(1)
+    before, after = np.roll(fastest, 1), np.roll(fastest, -1)
+    found = times[(fastest <= before) & (fastest < after) & (fastest < QUIET)]
+    if not len(found):
+        raise ValueError(
+            f"clip {clip.name!r} has no moment to halt at: its fastest foot never moves slower than "
+            f"{fastest.min():.2f} m/s ({QUIET} is asked for); leave halt at 0"
+        )
+    return found
+
+
+def _play(speed: np.ndarray, quiet: np.ndarray, halt: float, rng: np.random.Generator, clip: Clip) -> np.ndarray:
+    """The clip's time at every step, played at speed (T,), and at rest now and then at one of the quiet times."""
+    phase, rates = np.zeros(len(speed)), []
+    wait = rng.exponential(halt) if halt else np.inf
+    for t in range(1, len(speed)):
+        rate = speed[t]
+        if not rates and wait <= 0:
+            ahead = (quiet - phase[t - 1]) % clip.seconds if clip.loop else quiet - phase[t - 1]
+            near = ahead[(ahead > 0.3 * rate * RAMP) & (ahead <= 0.5 * rate * RAMP)]
+            if len(near):
+                rates, wait = _rest(near.min(), rate, rng), rng.exponential(halt)
+        elif not rates:
+            wait -= 1 / FPS
+        phase[t] = phase[t - 1] + (rates.pop(0) if rates else rate) / FPS
+    return phase
+
+
+def _rest(distance: float, rate: float, rng: np.random.Generator) -> list[float]:
+    """Rates of a stop within `distance` seconds of the clip, of a stay and of a start."""
+    down = max(round(2 * distance / rate * FPS), 1)
+    slowing = rate * (1 + np.cos(np.pi * (np.arange(down) + 0.5) / down)) / 2
+    still, up = np.zeros(round(rng.uniform(*STAY) * FPS)), round(RAMP * FPS)
+    starting = rate * (1 - np.cos(np.pi * (np.arange(up) + 0.5) / up)) / 2
+    return [*slowing, *still, *starting]
+
+
+def _bend(qpos: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Poses (T, nq) whose path turns by rate (T,) radians per second more than it did, leaning into the turn."""
+    angle = np.concatenate([[0.0], np.cumsum(rate[:-1])]) / FPS
+    half = (angle[1:] + angle[:-1]) / 2
+    step = np.diff(qpos[:, :2], axis=0)
+    cos, sin = np.cos(half), np.sin(half)
+    path = np.stack([cos * step[:, 0] - sin * step[:, 1], sin * step[:, 0] + cos * step[:, 1]], axis=1)
+    out = qpos.copy()
+    out[1:, :2] = qpos[0, :2] + np.cumsum(path, axis=0)
+    # Lean about the point on the floor below the root, towards the centre of the turn, by the path's own mean speed.
+    window = min(round(FPS), len(path))
+    speed = np.linalg.norm(path, axis=1) * FPS
+    speed = np.convolve(
+        np.pad(speed, (window // 2, window - window // 2), mode="edge"), np.ones(window) / window, "valid"
+    )
+    lean = np.arctan(speed[: len(qpos)] * rate / GRAVITY)
+    along = rotation.heading(qpos[:, 3:7]) + angle
+    axis = np.stack([np.cos(along), np.sin(along), np.zeros_like(along)], axis=1)
+    tilt = rotation.from_rotvec(-lean[:, None] * axis)
+    above = np.zeros((len(qpos), 3))
+    above[:, 2] = qpos[:, 2]
+    out[:, 3:7] = rotation.multiply(tilt, rotation.multiply(rotation.about_z(angle), qpos[:, 3:7]))
+    out[:, :3] = np.concatenate([out[:, :2], np.zeros((len(qpos), 1))], axis=1) + rotation.rotate(tilt, above)
+    return out
