@@ -457,7 +457,9 @@ TASK_NAMES = "target|steering|path"
     "--adapter", default=None, metavar="cola|lora|dora|full", help="What bends it.  [default: cola, or that of --from]"
 )
 @click.option("--method", default="rl", show_default=True, help="Of sft,hindsight,rl, in this order.")
-@click.option("--clips", "paths", multiple=True, type=PATHS, help="Example motions for sft: file, library or folder.")
+@click.option(
+    "--clips", "paths", multiple=True, type=PATHS, help="Motions for sft and hindsight: file, library or folder."
+)
 @click.option("--from", "start", default=None, type=PATHS, help="A fine-tuned skill whose adapter rl begins with.")
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")

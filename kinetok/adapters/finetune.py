@@ -7,7 +7,7 @@
 Three methods, each of which may be left out:
 
 1. sft        cross-entropy on the tokens of example clips, tracked by the frozen tokenizer: a style    out/sft
-2. hindsight  cross-entropy on own tokens, given what came of them: the task, without a reward    out/hindsight
+2. hindsight  cross-entropy on tokens of clips and own ones, given what came of them: the task    out/hindsight
 3. rl         PPO over the tokens of a control step, within the frozen prior's nucleus: the task            out
 
 The last one asked for writes to `out` itself. A method begins with the best of the one before it; rl may begin
@@ -34,12 +34,14 @@ from kinetok.config import ConfigError, diff, from_dict, nearest, pick, to_dict
 from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.pretrain import THREADS
 from kinetok.motion.clip import Clip
+from kinetok.motion.library import ClipLibrary
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import Training
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks import TASKS, GoalConfig, TargetConfig
+from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.train import in_scene
 
 METHODS = ("sft", "hindsight", "rl")
@@ -166,9 +168,9 @@ def finetune(
 ) -> Skill:
     """Run the methods that are not finished yet, write the best skill to `out` and return it.
 
-    base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft. start: the adapter, of
-    the same shape and prior, that rl begins with. threads: of physics and torch; 0 is every core for physics and two
-    for torch.
+    base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft and hindsight. start:
+    the adapter, of the same shape and prior, that rl begins with. threads: of physics and torch; 0 is every core for
+    physics and two for torch.
     """
     with torch_threads(threads or THREADS):
         return _finetune(prior, config, out, base, clips, start, seed=seed, threads=threads, quiet=quiet)
@@ -210,7 +212,7 @@ def _finetune(
         _imitate(skill, config, places["sft"], clips, identity, **told)
         identity["start"] = _take(skill, places["sft"])
     if "hindsight" in config.methods:
-        _look_back(skill, config, places["hindsight"], identity, **told)
+        _look_back(skill, config, places["hindsight"], clips, identity, **told)
         identity["start"] = _take(skill, places["hindsight"])
     if "rl" in config.methods:
         _reinforce(skill, config, out, identity, **told)
@@ -222,8 +224,8 @@ def _check(prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: P
     """Refuse what cannot be done, before any of it is."""
     if "sft" in config.methods and not clips:
         raise ConfigError("supervised fine-tuning needs example clips: --clips PATH")
-    if clips and "sft" not in config.methods:
-        raise ConfigError("the clips are used by supervised fine-tuning alone; add --method sft, or both: sft,rl")
+    if clips and config.methods == ("rl",):
+        raise ConfigError("reinforcement learning uses no clips; add --method sft or hindsight, or both: hindsight,rl")
     body = prior.tokenizer.config.character
     for clip in clips:
         if clip.character != body:
@@ -294,14 +296,25 @@ def _imitate(
 
 
 def _look_back(
-    skill: Skill, config: FinetuneConfig, out: Path, identity: dict, *, seed: int, threads: int, quiet: bool
+    skill: Skill,
+    config: FinetuneConfig,
+    out: Path,
+    clips: Sequence[Clip],
+    identity: dict,
+    *,
+    seed: int,
+    threads: int,
+    quiet: bool,
 ) -> None:
+    table = ReferenceTable(ClipLibrary.of(clips), control_hz=skill.prior.fps) if clips else None
     task = task_of(config.task, skill.prior, config.hindsight.rows)
     scene = skill.prior.tokenizer.config.scene
     world = replace(in_scene(config.env, scene), episode_seconds=config.hindsight.seconds + 1)
     env = Env(world, task, rows=config.hindsight.rows, threads=threads, seed=seed)
     policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy)
     story = f"hindsight, {config.hindsight.rounds} rounds"
+    if clips:
+        story += f", and what the tokenizer does of the clips {', '.join(clip.name for clip in clips)}"
     own = {"task": to_dict(config.task), "policy": to_dict(config.policy), "adapter": to_dict(config.adapter)}
     hindsight(
         policy,
@@ -311,7 +324,9 @@ def _look_back(
         evaluate=lambda: _judge(policy, skill, config, seed, threads),
         keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
         identity=identity | own,
+        table=table,
         seed=seed,
+        threads=threads,
         quiet=quiet,
     )
 

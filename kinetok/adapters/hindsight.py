@@ -2,15 +2,18 @@
 
     hindsight(policy, env, HindsightConfig(), out, evaluate=evaluate, keep=keep, identity=identity, seed=0)
 
-The policy plays the task; afterwards every step is relabelled with a task observation that the following seconds
-fulfilled (a target it reached, a velocity it had, a path it took), and the adapter learns by cross-entropy to
-choose the tokens that were chosen, given that observation. No reward and no critic: the prior's own variety is
-the teacher. Steps before a fall are left out, so that what remains upright is learned. Repeated from its own
-roll-outs, the policy reaches further from round to round.
+A motion that was made for no task at all came somewhere. Every step of it is relabelled with a task observation that
+the following seconds fulfilled (a target it reached, a velocity it had, a path it took), and the adapter learns by
+cross-entropy to choose the tokens that were chosen, given that observation. No reward and no critic: the variety of
+the motion is the teacher. Steps before a fall are left out, so that what remains upright is learned.
+
+Two sources of motion: recorded clips, which the frozen tokenizer tracks (`demonstrate`), and the policy itself, which
+plays the task round after round. Clips that turn and halt on purpose say far more about where tokens lead than what
+a prior draws at random, whose turns cancel within a second.
 
 Goal-conditioned supervised learning (Ghosh et al. 2021, "Learning to reach goals via iterated supervised
-learning"), which GPC does not use: on two cores it brings in minutes what policy gradients over tokens need hours
-for, and reinforcement learning goes on from there.
+learning"; of demonstrations, Ding et al. 2019, "Goal-conditioned imitation learning"), which GPC does not use:
+reinforcement learning goes on from there.
 """
 
 from collections.abc import Callable
@@ -26,21 +29,24 @@ from kinetok import rotation
 from kinetok.adapters.rlft import TokenPolicy
 from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.config import to_dict
-from kinetok.gpt.data import before_failure
+from kinetok.gpt.data import Rollout, before_failure, roam
 from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import Score, refuse_changed
-from kinetok.sim.env import Env
+from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks.tracking import ReferenceTable
 
 S = TypeVar("S", bound=Score)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HindsightConfig:
-    """rounds: of playing and learning; rows, seconds: played in each; iterations of
-    `batch` samples in each, at lr, falling to a tenth over all rounds; memory: rounds whose samples are kept; doomed:
-    seconds before a fall that are left out; label_smoothing; sectors: directions of what was asked and of what was
-    fulfilled are counted in so many, and samples drawn so that both are alike; boost: at most so much more often."""
+    """rounds: of learning, each of `iterations` of `batch` samples at lr, falling to a tenth over all rounds; rows,
+    seconds: of the task played before each round, but for the first where there are clips; memory: rounds whose samples
+    are kept; samples: control steps of tracked clips, which are kept all the time; code_noise, transitions, env: of the
+    tracking, as in recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors:
+    directions of what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are
+    alike; boost: at most so much more often."""
 
     rounds: int = 4
     rows: int = 512
@@ -49,6 +55,10 @@ class HindsightConfig:
     batch: int = 512
     lr: float = 3e-3
     memory: int = 2
+    samples: int = 200_000
+    code_noise: float = 0.05
+    transitions: float = 0.1
+    env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.3, episode_seconds=20.0)
     doomed: float = 1.5
     label_smoothing: float = 0.0
     sectors: int = 16
@@ -64,11 +74,16 @@ def hindsight(
     evaluate: Callable[[], S],
     keep: Callable[[S], None],
     identity: dict,
+    table: ReferenceTable | None = None,
     seed: int = 0,
+    threads: int = 0,
     quiet: bool = False,
 ) -> None:
-    """Adapt in place. After each round `evaluate` measures, and `keep` is called with the best score so far. `out`
-    receives metrics.jsonl and a state from which a later call with the same identity goes on after the last round."""
+    """Adapt in place. After each round `evaluate` measures, and `keep` is called with the best score so far.
+
+    table: the clips to learn from, if any. `out` receives metrics.jsonl and a state from which a later call with the
+    same identity goes on after the last round.
+    """
     adapted, best = policy.adapted, -1e9
     identity = identity | {"stage": to_dict(config)}
     path, done = out / "state.safetensors", 0
@@ -84,12 +99,16 @@ def hindsight(
         generator.set_state(tree["generator"])
         memory, done, best = [tuple(part) for part in tree["memory"]], meta["round"], meta["best"]
     total = config.rounds * config.iterations
+    demonstrated = []
+    if table is not None and done < config.rounds:
+        demonstrated = [relabel(demonstrate(policy, table, config, seed, threads, quiet), env, config, seed)]
     with Logger(out, total=total, title="hindsight", start=done * config.iterations, quiet=quiet) as log:
         for number in range(done, config.rounds):
             env.rng = np.random.default_rng([seed, number])
-            memory = [*memory, relabel(*play_on(policy, env, config, generator), env, config, seed + number)]
-            memory = memory[-config.memory :]
-            state, c, tokens, weight = (torch.cat(parts) for parts in zip(*memory, strict=True))
+            if number or not demonstrated:
+                memory = [*memory, relabel(play_on(policy, env, config, generator), env, config, seed + number)]
+                memory = memory[-config.memory :]
+            state, c, tokens, weight = (torch.cat(parts) for parts in zip(*demonstrated, *memory, strict=True))
             adapted.observe(c)
             for iteration in range(config.iterations):
                 step = number * config.iterations + iteration
@@ -128,56 +147,64 @@ def hindsight(
             save_state(path, tensors, meta)
 
 
-def play_on(
-    policy: TokenPolicy, env: Env, config: HindsightConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor, np.ndarray, np.ndarray, np.ndarray]:
-    """`seconds` of the policy in every row: obs (T, N, O), tokens (T, N, S), root (T, N, 7) position and quaternion,
-    terminated and done (T, N)."""
+def play_on(policy: TokenPolicy, env: Env, config: HindsightConfig, generator: torch.Generator) -> Rollout:
+    """`seconds` of the policy in every row."""
     steps = round(config.seconds * env.config.scene.control_hz)
-    obs, seen, chosen = torch.from_numpy(env.reset()), [], []
-    root = np.empty((steps, env.rows, 7), np.float32)
-    terminated, done = np.zeros((2, steps, env.rows), bool)
+    played = Rollout.empty(steps, env.rows, policy.state_dim, policy.tokens.tokens_per_step)
+    obs = torch.from_numpy(env.reset())
     with torch.no_grad(), torch_threads(1):
         for t in range(steps):
-            root[t] = env.sim.qpos[:, :7]
+            played.root[t] = env.sim.qpos[:, :7]
             action, taken = policy.draw(obs, generator)
-            seen.append(obs)
-            chosen.append(taken["tokens"].to(torch.int32))
+            played.states[t], played.tokens[t] = obs[:, : policy.state_dim], taken["tokens"]
             step = env.step(action.numpy())
-            terminated[t], done[t, step.done] = step.terminated, True
+            played.terminated[t], played.cut[t, step.done] = step.terminated, True
             obs = torch.from_numpy(step.obs)
     env.episode_metrics()
-    return torch.stack(seen), torch.stack(chosen), root, terminated, done
+    return played
 
 
-def relabel(
-    obs: Tensor,
-    tokens: Tensor,
-    root: np.ndarray,
-    terminated: np.ndarray,
-    done: np.ndarray,
-    env: Env,
-    config: HindsightConfig,
-    seed: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def demonstrate(
+    policy: TokenPolicy, table: ReferenceTable, config: HindsightConfig, seed: int, threads: int, quiet: bool
+) -> Rollout:
+    """`samples` control steps of the frozen tokenizer on the table's clips."""
+    return roam(
+        policy.tokenizer,
+        table,
+        samples=config.samples,
+        rows=config.rows,
+        seed=seed,
+        threads=threads,
+        env=config.env,
+        transitions=config.transitions,
+        code_noise=config.code_noise,
+        quiet=quiet,
+    )
+
+
+def relabel(rolled: Rollout, env: Env, config: HindsightConfig, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """state (M, S), c (M, C), tokens (M, T) of the steps for which the task finds something that came true, and how
     often each is to be drawn (M,)."""
+    terminated, cut = rolled.terminated, rolled.cut
     doomed = round(config.doomed * env.config.scene.control_hz)
-    good = ~before_failure(terminated, done, doomed)
-    # The last step that each step may look ahead to: its episode's last, or what came well before a fall.
-    ends = np.where(done, np.arange(len(done))[:, None] - np.where(terminated, doomed, 0), 2 * len(done))
-    last = np.where(done, np.arange(len(done))[:, None], len(done) - 1)
+    good = ~before_failure(terminated, cut, doomed)
+    # The last step that each step may look ahead to: its path's last, or what came well before a fall.
+    now = np.arange(len(cut))[:, None]
+    ends = np.where(cut, now - np.where(terminated, doomed, 0), 2 * len(cut))
+    last = np.where(cut, now, len(cut) - 1)
     last = np.minimum.accumulate(last[::-1], axis=0)[::-1]
-    ends = np.minimum(np.take_along_axis(ends, last, 0), len(done) - 1)
-    c, told = env.task.hindsight(root[..., :2], rotation.heading(root[..., 3:]), ends, np.random.default_rng(seed))
+    ends = np.minimum(np.take_along_axis(ends, last, 0), len(cut) - 1)
+    heading = rotation.heading(rolled.root[..., 3:])
+    c, told = env.task.hindsight(rolled.root[..., :2], heading, ends, np.random.default_rng(seed))
     keep = torch.from_numpy(good & told)
     if not keep.any():
         raise ValueError(
-            f"in {config.seconds} s of {env.rows} rows nothing came true that the task could have asked for; "
-            "play longer (hindsight.seconds), or look at the prior with `kinetok evaluate prior`"
+            f"in {cut.size} control steps nothing came true that the task could have asked for; "
+            "play longer (hindsight.seconds, hindsight.samples), or look at the prior with `kinetok evaluate prior`"
         )
-    fulfilled, asked = torch.from_numpy(c)[keep], obs[..., env.task.layout["task"]].flatten(0, 1)
-    return obs[..., env.task.layout["state"]][keep], fulfilled, tokens[keep], balance(fulfilled, asked, config)
+    fulfilled = torch.from_numpy(c)[keep]
+    asked = torch.from_numpy(env.reset()[:, env.task.layout["task"]])
+    return rolled.states[keep], fulfilled, rolled.tokens[keep], balance(fulfilled, asked, config)
 
 
 def balance(fulfilled: Tensor, asked: Tensor, config: HindsightConfig) -> Tensor:

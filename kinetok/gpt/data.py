@@ -7,7 +7,7 @@
 GPC sec. 6 trains its prior on rollouts of the frozen tracker. The worlds are driven by decode(codes), never by
 the reference, so the states are those the decoder itself produces; pushes and noisy starts put recoveries among
 them. Clips are drawn half of the time each as often as any other, half of the time by their duration, whatever
-the tracker fails at. The last half second before a failure is left out.
+the tracker fails at. The last second before a failure is left out.
 
 The clips are joined into one endless motion (sim.tasks.roaming): a row changes to another clip at random
 (`transitions` per second) and, wherever a like frame exists, before a clip ends, so that the prior learns what
@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from einops import rearrange
 from torch import Tensor
 
 from kinetok.checkpoint import load_state, save_state
@@ -35,7 +34,7 @@ from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.train import in_scene
 
-BEFORE_FAILURE = 0.5  # seconds; more than roaming.GRACE, so that what a landing spoiled is left out
+BEFORE_FAILURE = 1.0  # seconds; more than roaming.GRACE, so that what a landing spoiled is left out
 STARTS = 512
 
 
@@ -129,7 +128,33 @@ def before_failure(terminated: np.ndarray, done: np.ndarray, steps: int) -> np.n
     return doomed
 
 
-def record(
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rollout:
+    """T control steps of N worlds. states (T, N, S) float32; tokens (T, N, K) int32 chosen in them; root (T, N, 7):
+    position and quaternion before the step; terminated: the step failed; cut: the path breaks off after the step, for
+    a new episode or a new clip. clip (T, N): what was followed, -1 for nothing."""
+
+    states: Tensor = field(repr=False)
+    tokens: Tensor = field(repr=False)
+    root: np.ndarray = field(repr=False)
+    terminated: np.ndarray = field(repr=False)
+    cut: np.ndarray = field(repr=False)
+    clip: np.ndarray = field(repr=False)
+
+    @staticmethod
+    def empty(steps: int, rows: int, state_dim: int, tokens: int) -> "Rollout":
+        """One to be filled in."""
+        return Rollout(
+            states=torch.empty(steps, rows, state_dim),
+            tokens=torch.empty(steps, rows, tokens, dtype=torch.int32),
+            root=np.empty((steps, rows, 7), np.float32),
+            terminated=np.zeros((steps, rows), bool),
+            cut=np.zeros((steps, rows), bool),
+            clip=np.full((steps, rows), -1, np.int32),
+        )
+
+
+def roam(
     tokenizer: MotionTokenizer,
     table: ReferenceTable,
     *,
@@ -142,14 +167,8 @@ def record(
     code_noise: float = 0.0,
     reach_at_end: float = REACH,
     quiet: bool = False,
-) -> TokenDataset:
-    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
-
-    env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of the scalars whose
-    executed code is one level off while the recorded one is not, so that the data shows how to go on from the states
-    that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017). transitions, reach_at_end:
-    see `Roaming`. The result depends on `seed` and not on `threads`.
-    """
+) -> Rollout:
+    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; arguments as of `record`."""
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 1])
     tracking = TrackingConfig(future=tokenizer.config.future)
@@ -158,23 +177,42 @@ def record(
     task.weights.values = clip_weights(table)
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part = -(-samples // rows), task.layout["state"]
-    states = torch.empty(steps, rows, part.stop - part.start)
-    tokens = torch.empty(steps, rows, layout.tokens_per_step, dtype=torch.int32)
-    clip, terminated, done = np.empty((steps, rows), np.int32), *np.zeros((2, steps, rows), bool)
+    rolled = Rollout.empty(steps, rows, part.stop - part.start, layout.tokens_per_step)
     obs = world.reset(spread=True)
     log = Logger(None, total=samples, title="record", quiet=quiet)
     with torch.no_grad(), torch_threads(1), log:
         for t in range(steps):
             seen = torch.from_numpy(obs)
             codes = tokenizer.encode(seen)
-            states[t], tokens[t], clip[t] = seen[:, part], layout.to_tokens(codes), task.clip
+            rolled.states[t], rolled.tokens[t] = seen[:, part], layout.to_tokens(codes)
+            rolled.root[t], rolled.clip[t] = world.sim.qpos[:, :7], task.clip
             played = jitter(codes, code_noise, tokenizer.quantizer.levels[0], rng) if code_noise else codes
             step = world.step(tokenizer.decode(played, seen[:, part]).numpy())
-            terminated[t], done[t], obs = step.terminated, step.terminated | step.truncated, step.obs
+            rolled.terminated[t], obs = step.terminated, step.obs
+            rolled.cut[t] = step.terminated | step.truncated | (task.landing >= 0)
             task.land(world, obs)
             if t % 20 == 19 or t == steps - 1:
                 log.write((t + 1) * rows - 1, world.episode_metrics())
-    good = ~before_failure(terminated, done, round(BEFORE_FAILURE * scene.control_hz))
+    return rolled
+
+
+def record(
+    tokenizer: MotionTokenizer,
+    table: ReferenceTable,
+    *,
+    rows: int = 256,
+    seed: int = 0,
+    **settings: Any,
+) -> TokenDataset:
+    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
+
+    settings: of `roam`. env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of
+    the scalars whose executed code is one level off while the recorded one is not, so that the data shows how to go on
+    from the states that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017).
+    transitions, reach_at_end: see `Roaming`. The result depends on `seed` and not on `threads`.
+    """
+    rolled = roam(tokenizer, table, rows=rows, seed=seed, **settings)
+    good = ~before_failure(rolled.terminated, rolled.cut, round(BEFORE_FAILURE * tokenizer.config.scene.control_hz))
     if not good.any():
         raise ValueError(
             f"the tokenizer follows none of {', '.join(table.names)} for more than {BEFORE_FAILURE} s, so there is "
@@ -182,10 +220,10 @@ def record(
         )
     kept = torch.from_numpy(good.ravel())
     return TokenDataset(
-        states=rearrange(states, "t n s -> (t n) s")[kept],
-        tokens=rearrange(tokens, "t n s -> (t n) s")[kept],
-        clip=torch.from_numpy(clip.ravel())[kept],
-        world=torch.arange(rows, dtype=torch.int32).repeat(steps)[kept],
+        states=rolled.states.flatten(0, 1)[kept],
+        tokens=rolled.tokens.flatten(0, 1)[kept],
+        clip=torch.from_numpy(rolled.clip.ravel())[kept],
+        world=torch.arange(rows, dtype=torch.int32).repeat(len(rolled.cut))[kept],
         names=tuple(table.names),
         starts=draw_starts(table, STARTS, np.random.default_rng([seed, 2])),
     )

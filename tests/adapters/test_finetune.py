@@ -246,7 +246,7 @@ WRONG = {  # config; options from the clips and a finished run; message
     "clips for nothing": (
         TINY,
         lambda clips, skill: {"clips": clips},
-        "the clips are used by supervised fine-tuning alone; add --method sft",
+        "reinforcement learning uses no clips; add --method sft or hindsight",
     ),
     "clips of another body": (
         BOTH,
