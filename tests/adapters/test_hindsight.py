@@ -35,9 +35,9 @@ def run(models, out, settings, **options):
     return finetune(prior, settings, out, base=models / "prior", threads=1, quiet=True, **options)
 
 
-@pytest.mark.parametrize("task", ["target", "steering", "path"])
-def test_every_task_learns_from_its_own_play(models, tmp_path, task):
-    settings = config(hindsight=replace(SMALL, seconds=7.0 if task == "path" else 1.5, rounds=1))
+@pytest.mark.parametrize("task", ["target", "steering"])
+def test_a_task_learns_from_its_own_play(models, tmp_path, task):
+    settings = config(hindsight=replace(SMALL, rounds=1))
     run(models, tmp_path, reshaped(settings, task=task, adapter="lora"))
     assert "hindsight, 1 rounds" in (tmp_path / "README.md").read_text()
 
@@ -92,7 +92,7 @@ def test_the_target_of_a_straight_path_lies_straight_ahead(prior):
     at = state[:, 0]
     assert (c[:, 0] <= (199 - at) * 0.04 + 1e-3).all()
     fallen = np.bincount(at.long().numpy(), minlength=200)
-    assert fallen[:20].max() == 2 and fallen[21:51].max() == 1
+    assert fallen[21:51].max() == 1 and fallen[51:].max() == 2
 
 
 def test_rare_directions_are_drawn_as_often_as_they_are_asked_for():
