@@ -55,7 +55,9 @@ class Plain(nn.Module):
         self.norm.observe(obs)
 
 
-def scratch(task: str, samples: int, out: Path, *, seed: int = 0, threads: int = 0, episodes: int = 256) -> dict[str, Any]:
+def scratch(
+    task: str, samples: int, out: Path, *, seed: int = 0, threads: int = 0, episodes: int = 256
+) -> dict[str, Any]:
     """Train for `samples` control steps in `out` and measure the best evaluation anew."""
     prior, config = Prior.from_pretrained("humanoid-gpt"), reshaped(FinetuneConfig(), task=task, adapter="cola")
     ppo = PPOConfig(gamma=config.ppo.gamma)

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "kinetok"
 
-GROUND = {"config", "checkpoint", "rotation", "metrics", "logger"}
+GROUND = {"config", "checkpoint", "rotation", "metrics", "logger", "resume"}
 FRONT = {"demo", "evaluate", "presets", "render"}
 BELOW = {
     "ground": set(),

@@ -263,6 +263,19 @@ class Parameters(NamedTuple):
     share: float
 
 
+class AdapterPart:
+    """The adapter of an adapted model alone, as a run saves and restores it (resume.Part)."""
+
+    def __init__(self, adapted: Adapted):
+        self.adapted = adapted
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.adapted.adapter_state()
+
+    def load_state_dict(self, state: dict[str, Tensor], /) -> None:
+        self.adapted.load_adapter_state_(state)
+
+
 def parameters_of(adapted: Adapted) -> Parameters:
     """How many parameters the adapter trains beside how many of the base."""
     trainable = sum(parameter.numel() for parameter in adapted.trainable())

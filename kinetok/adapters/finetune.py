@@ -25,7 +25,7 @@ from pathlib import Path
 import torch
 
 from kinetok.adapters import ADAPTERS, AdapterConfig, CoLAConfig
-from kinetok.adapters.adapted import Adapted, AdaptedConfig, fingerprint, parameters_of
+from kinetok.adapters.adapted import Adapted, AdaptedConfig, AdapterPart, fingerprint, parameters_of
 from kinetok.adapters.hindsight import HindsightConfig, hindsight
 from kinetok.adapters.rlft import Controller, TaskScore, TokenPolicy, TokenPolicyConfig, play, task_of
 from kinetok.adapters.sft import SFTConfig, supervise
@@ -366,7 +366,7 @@ def _reinforce(
         policy=policy,
         critic=Critic(env.obs_size, config.critic),
         config=config.ppo,
-        modules={"adapter": policy},
+        modules={"adapter": AdapterPart(skill.adapted)},
         identity={"stage": to_dict(config)} | identity,
         kinds={"stage": FinetuneConfig},
         seed=seed,

@@ -26,13 +26,14 @@ import torch
 from torch import Tensor
 
 from kinetok import rotation
+from kinetok.adapters.adapted import AdapterPart
 from kinetok.adapters.rlft import TokenPolicy
-from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.config import to_dict
 from kinetok.gpt.data import Rollout, before_failure, roam
 from kinetok.logger import Logger
+from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
-from kinetok.rl.training import Score, refuse_changed
+from kinetok.rl.training import Score
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
 
@@ -84,20 +85,15 @@ def hindsight(
     table: the clips to learn from, if any. `out` receives metrics.jsonl and a state from which a later call with the
     same identity goes on after the last round.
     """
-    adapted, best = policy.adapted, -1e9
-    identity = identity | {"stage": to_dict(config)}
-    path, done = out / "state.safetensors", 0
+    adapted, best, done = policy.adapted, -1e9, 0
     optimizer = torch.optim.Adam(adapted.trainable(), lr=config.lr, fused=True)
     generator = torch.Generator().manual_seed(seed)
+    parts = {"adapted": AdapterPart(adapted), "optimizer": optimizer, "generator": generator}
+    state = State(out, parts, identity=identity | {"stage": to_dict(config)}, kinds={"stage": HindsightConfig})
     memory: list[tuple[Tensor, ...]] = []
-    if path.exists():
-        tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, {"stage": HindsightConfig})
-        tree = unflatten(tensors, meta["tree"])
-        adapted.load_adapter_state_(tree["adapted"])
-        optimizer.load_state_dict(tree["optimizer"])
-        generator.set_state(tree["generator"])
-        memory, done, best = [tuple(part) for part in tree["memory"]], meta["round"], meta["best"]
+    if before := state.restore():
+        meta, kept = before
+        memory, done, best = [tuple(part) for part in kept["memory"]], meta["round"], meta["best"]
     total = config.rounds * config.iterations
     demonstrated = []
     if table is not None and done < config.rounds:
@@ -108,17 +104,17 @@ def hindsight(
             if number or not demonstrated:
                 memory = [*memory, relabel(play_on(policy, env, config, generator), env, config, seed + number)]
                 memory = memory[-config.memory :]
-            state, c, tokens, weight = (torch.cat(parts) for parts in zip(*demonstrated, *memory, strict=True))
+            seen, c, tokens, weight = (torch.cat(parts) for parts in zip(*demonstrated, *memory, strict=True))
             adapted.observe(c)
             for iteration in range(config.iterations):
                 step = number * config.iterations + iteration
                 for group in optimizer.param_groups:
                     group["lr"] = config.lr * (1 - 0.9 * step / total)
                 ids = torch.multinomial(weight, config.batch, replacement=True, generator=generator)
-                loss, told = adapted.loss(state[ids], c[ids], tokens[ids].long(), config.label_smoothing)
+                loss, told = adapted.loss(seen[ids], c[ids], tokens[ids].long(), config.label_smoothing)
                 if not torch.isfinite(loss):
                     raise FloatingPointError(
-                        f"the loss is {loss.item()} in round {number}; the last good state is {path}; "
+                        f"the loss is {loss.item()} in round {number}; the last good state is {state.path}; "
                         "try a smaller --set hindsight.lr"
                     )
                 optimizer.zero_grad(set_to_none=True)
@@ -129,22 +125,14 @@ def hindsight(
                 metrics = {f"hindsight/{name}": float(value) for name, value in told.items()} if step % 10 == 9 else {}
                 if last:
                     score = evaluate()
-                    metrics |= {"samples": float(len(state))}
+                    metrics |= {"samples": float(len(seen))}
                     metrics |= {f"eval/{name}": value for name, value in score.summary().items()}
                     if score.merit > best:
                         best = score.merit
                         keep(score)
                 if metrics:
                     log.write(step, metrics)
-            tree = {
-                "adapted": adapted.adapter_state(),
-                "optimizer": optimizer.state_dict(),
-                "generator": generator.get_state(),
-                "memory": [list(part) for part in memory],
-            }
-            tensors, skeleton = flatten(tree)
-            meta = {"tree": skeleton, "identity": identity, "round": number + 1, "best": best}
-            save_state(path, tensors, meta)
+            state.save({"round": number + 1, "best": best}, memory=[list(part) for part in memory])
 
 
 def play_on(policy: TokenPolicy, env: Env, config: HindsightConfig, generator: torch.Generator) -> Rollout:

@@ -50,9 +50,7 @@ class TokenPolicyConfig:
 
 
 class TokenPolicy:
-    """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them.
-
-    Its state is the adapter's alone."""
+    """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them."""
 
     def __init__(self, adapted: Adapted, tokenizer: MotionTokenizer, config: TokenPolicyConfig):
         self.adapted, self.tokenizer, self.config = adapted, tokenizer, config
@@ -101,12 +99,6 @@ class TokenPolicy:
 
     def parameters(self) -> Iterable[nn.Parameter]:
         return self.adapted.trainable()
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.adapted.adapter_state()
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.adapted.load_adapter_state_(state)
 
     def controller(self, generator: torch.Generator | None) -> Controller:
         """The policy as it is played; without a generator greedily."""

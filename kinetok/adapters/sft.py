@@ -19,14 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kinetok.adapters.adapted import Adapted
-from kinetok.checkpoint import flatten, load_state, save_state, unflatten
+from kinetok.adapters.adapted import Adapted, AdapterPart
 from kinetok.config import ConfigError, to_dict
 from kinetok.gpt.data import TokenDataset, record
 from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
-from kinetok.rl.training import refuse_changed
+from kinetok.resume import State
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -82,20 +81,15 @@ def supervise(
     library = ClipLibrary.of(clips)
     frames = hashlib.sha256(library.frames.tobytes()).hexdigest()
     identity = {"sft": to_dict(config), "frames": frames} | identity
-    path, step, best = out / "state.safetensors", 0, {"held_out/cross_entropy": math.inf}
+    step, best = 0, {"held_out/cross_entropy": math.inf}
     parameters = [p for p in adapted.gpt.parameters() if p.requires_grad]  # all but the nets that read c
     optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # dropout's
-    if path.exists():
-        tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, {"sft": SFTConfig})
-        tree = unflatten(tensors, meta["tree"])
-        adapted.load_adapter_state_(tree["adapter"])
-        optimizer.load_state_dict(tree["optimizer"])
-        generator.set_state(tree["generator"])
-        torch.set_rng_state(tree["dropout"])
-        step, best = meta["step"], tree["best"]
+    parts = {"optimizer": optimizer, "generator": generator, "dropout": torch.default_generator}
+    state = State(out, {"adapter": AdapterPart(adapted), **parts}, identity=identity, kinds={"sft": SFTConfig})
+    if before := state.restore():
+        step, best = before[0]["step"], before[1]["best"]
     if step >= config.iterations:
         return best
     table = ReferenceTable(library, control_hz=tokenizer.config.scene.control_hz)
@@ -122,7 +116,7 @@ def supervise(
             if not torch.isfinite(value):
                 raise FloatingPointError(
                     f"the loss is {value.item()} at iteration {step}; the last good state, if there is one yet, is "
-                    f"{path}; try a smaller --set sft.lr"
+                    f"{state.path}; try a smaller --set sft.lr"
                 )
             optimizer.zero_grad(set_to_none=True)
             value.backward()
@@ -140,15 +134,7 @@ def supervise(
                     save(best)
             log.write(step - 1, metrics)
             if evaluating:
-                tree = {
-                    "adapter": adapted.adapter_state(),
-                    "optimizer": optimizer.state_dict(),
-                    "generator": generator.get_state(),
-                    "dropout": torch.get_rng_state(),
-                    "best": best,
-                }
-                tensors, skeleton = flatten(tree)
-                save_state(path, tensors, {"tree": skeleton, "identity": identity, "step": step})
+                state.save({"step": step}, best=best)
     return best
 
 

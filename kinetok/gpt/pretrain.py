@@ -17,14 +17,14 @@ import copy
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, flatten, load_artifact, load_state, save_state, unflatten
+from kinetok.checkpoint import CheckpointError, load_artifact
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.data import TokenDataset, record
@@ -33,6 +33,7 @@ from kinetok.gpt.refine import RefineConfig, refine
 from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
+from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.roaming import REACH
@@ -186,17 +187,12 @@ def train(
     generator = torch.Generator().manual_seed(seed)
     learn, hold = data.split(config.held_out)
     hold = hold[torch.linspace(0, len(hold) - 1, min(len(hold), EVAL_SAMPLES)).long()] if len(hold) else hold
-    path, step, best = out / "state.safetensors", 0, {"held_out/cross_entropy": math.inf}
-    if path.exists():
-        tensors, meta = load_state(path)
-        _same_run(path, meta["identity"], identity, config, [key for key in to_dict(config) if key != "refine"])
-        tree = unflatten(tensors, meta["tree"])
-        gpt.load_state_dict(tree["gpt"])
-        average.load_state_dict(tree["average"])
-        optimizer.load_state_dict(tree["optimizer"])
-        generator.set_state(tree["generator"])
-        torch.set_rng_state(tree["dropout"])
-        step, best = meta["step"], tree["best"]
+    step, best = 0, {"held_out/cross_entropy": math.inf}
+    parts = {"gpt": gpt, "average": average, "optimizer": optimizer, "generator": generator}
+    own = identity | {"config": to_dict(replace(config, refine=RefineConfig(rounds=0)))}  # refining comes after
+    state = State(out, parts | {"dropout": torch.default_generator}, identity=own, kinds={"config": PretrainConfig})
+    if before := state.restore():
+        step, best = before[0]["step"], before[1]["best"]
     gpt.train()
     log = Logger(out, total=config.iterations, title="pretrain", start=step, quiet=quiet)
     with torch_threads(threads or THREADS), log:
@@ -214,18 +210,7 @@ def train(
             if told:
                 log.write(step - 1, told)
             if evaluating:
-                tree = {
-                    "gpt": dict(gpt.state_dict()),
-                    "average": dict(average.state_dict()),
-                    "optimizer": optimizer.state_dict(),
-                    "generator": generator.get_state(),
-                    "dropout": torch.get_rng_state(),
-                    "best": best,
-                }
-                tensors, skeleton = flatten(tree)
-                save_state(
-                    path, tensors, {"tree": skeleton, "identity": identity | {"config": to_dict(config)}, "step": step}
-                )
+                state.save({"step": step}, best=best)
     return best
 
 

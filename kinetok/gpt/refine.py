@@ -20,13 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.gpt.controller import Prior, PriorController, roll
 from kinetok.gpt.data import TokenDataset
 from kinetok.gpt.model import GPT
 from kinetok.logger import Logger
+from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
-from kinetok.rl.training import refuse_changed
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.free import Free
 
@@ -79,17 +78,13 @@ def refine(
     playing = replace(prior, gpt=average)
     optimizer = torch.optim.AdamW(gpt.parameters(), lr=config.lr, betas=(0.9, 0.95), weight_decay=0.01, fused=True)
     generator = torch.Generator().manual_seed(seed)
-    path, done, best = out / "state.safetensors", 0, -1.0
+    parts = {"gpt": gpt, "average": average, "optimizer": optimizer, "generator": generator}
+    state = State(out, parts, identity=identity, kinds={"stage": RefineConfig})
+    done, best = 0, -1.0
     memory: list[tuple[Tensor, Tensor]] = []
-    if path.exists():
-        tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, {"stage": RefineConfig})
-        tree = unflatten(tensors, meta["tree"])
-        gpt.load_state_dict(tree["gpt"])
-        average.load_state_dict(tree["average"])
-        optimizer.load_state_dict(tree["optimizer"])
-        generator.set_state(tree["generator"])
-        memory = [(states, tokens) for states, tokens in tree["memory"]]
+    if before := state.restore():
+        meta, kept = before
+        memory = [(states, tokens) for states, tokens in kept["memory"]]
         done, best = meta["round"], meta["best"]
     if done == 0:
         best = survival(playing, config, seed, threads)
@@ -112,16 +107,7 @@ def refine(
                         save(playing, metrics | {"round": float(number)})
                 elif step % 20 == 19:
                     log.write(step, {"loss": loss})
-            tree = {
-                "gpt": dict(gpt.state_dict()),
-                "average": dict(average.state_dict()),
-                "optimizer": optimizer.state_dict(),
-                "generator": generator.get_state(),
-                "memory": [list(part) for part in memory],
-            }
-            tensors, skeleton = flatten(tree)
-            meta = {"tree": skeleton, "identity": identity, "round": number + 1, "best": best}
-            save_state(path, tensors, meta)
+            state.save({"round": number + 1, "best": best}, memory=[list(part) for part in memory])
 
 
 def survival(prior: Prior, config: RefineConfig, seed: int, threads: int) -> float:

@@ -19,21 +19,14 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import torch
 
-from kinetok.checkpoint import CheckpointError, flatten, load_state, save_state, unflatten
-from kinetok.config import ConfigError, diff, from_dict, to_dict
+from kinetok.checkpoint import save_state
 from kinetok.logger import Logger
+from kinetok.resume import Part, State
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
 from kinetok.rl.rollout import Rollout, World, collect
-
-
-class Part(Protocol):
-    """What a run trains, as far as saving goes; any nn.Module is one."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
 
 
 class Score(Protocol):
@@ -80,14 +73,10 @@ class Training:
         seed: int,
     ):
         self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
-        self.modules: dict[str, Part] = {"critic": critic, **modules}
-        self.identity, self.kinds = identity, kinds
         self.optimizers = Optimizers(policy, critic, config)
         self.generator = torch.Generator().manual_seed(seed)
-
-    @property
-    def path(self) -> Path:
-        return self.out / "state.safetensors"
+        parts = {"critic": critic, **modules, "optimizers": self.optimizers, "generator": self.generator}
+        self._state = State(out, parts, identity=identity, kinds=kinds)
 
     def train(
         self,
@@ -178,7 +167,11 @@ class Training:
         except FloatingPointError as error:
             dump = self.out / "bad_rollout.safetensors"
             save_state(dump, {"obs": rollout.obs, "rewards": rollout.rewards, **rollout.taken}, {})
-            left = f"the last good state in {self.path} is untouched" if self.path.exists() else "nothing was saved yet"
+            left = (
+                f"the last good state in {self._state.path} is untouched"
+                if self._state.path.exists()
+                else "nothing was saved yet"
+            )
             raise FloatingPointError(
                 f"{error}; training stopped. The rollout is in {dump}; {left}. "
                 "Try a smaller --set ppo.lr, or look at the clip with `kinetok clips info`"
@@ -186,51 +179,12 @@ class Training:
 
     def save(self, progress: Progress) -> None:
         """Write the state, from which `resume` goes on."""
-        tree = {name: dict(module.state_dict()) for name, module in self.modules.items()}
-        tree |= {"optimizers": self.optimizers.state_dict(), "generator": self.generator.get_state()}
-        tensors, skeleton = flatten(tree)
-        meta = {"tree": skeleton, "identity": self.identity, "progress": vars(progress)}
-        save_state(self.path, tensors, meta | {"env": json.dumps(self.world.state_dict())})
+        self._state.save({"progress": vars(progress), "env": json.dumps(self.world.state_dict())})
 
     def resume(self) -> Progress:
         """Take up the state in `out`; a fresh Progress where there is none. CheckpointError if it is another run's."""
-        if not self.path.exists():
+        before = self._state.restore()
+        if before is None:
             return Progress()
-        tensors, meta = load_state(self.path)
-        refuse_changed(self.path, meta["identity"], self.identity, self.kinds)
-        tree = unflatten(tensors, meta["tree"])
-        for name, module in self.modules.items():
-            module.load_state_dict(tree[name])
-        self.optimizers.load_state_dict(tree["optimizers"])
-        self.generator.set_state(tree["generator"])
-        self.world.load_state_dict(json.loads(meta["env"]))
-        return Progress(**meta["progress"])
-
-
-def refuse_changed(path: Path, old: dict, new: dict, kinds: Mapping[str, type]) -> None:
-    """Raise CheckpointError where the state at `path` is of another run, by its identity.
-
-    kinds: the config class behind keys of the identity: a setting that the old one does not know had its default.
-    A longer run is the same run: where both say `stage.samples`, the new one may be larger.
-    """
-    missing = [key for key in kinds if key not in old]
-    if missing:
-        raise CheckpointError(
-            f"{path} is the state of another kind of run: it has no {missing[0]}; choose another --out"
-        )
-    try:
-        old = old | {key: to_dict(from_dict(kind, old[key], key)) for key, kind in kinds.items()}
-    except ConfigError as error:
-        raise CheckpointError(
-            f"{path} is the state of another kind of run, or of another version of kinetok ({error}); "
-            "choose another --out"
-        ) from error
-    before, now = old.get("stage", {}).get("samples", 0), new.get("stage", {}).get("samples", 0)
-    if now > before:
-        old["stage"] = old["stage"] | {"samples": now}
-    changed = diff(old, new)
-    if changed:
-        raise CheckpointError(
-            f"{path}: this run was started with another configuration: {'; '.join(changed)}. "
-            "Repeat the old settings to go on, or choose another --out"
-        )
+        self.world.load_state_dict(json.loads(before[0]["env"]))
+        return Progress(**before[0]["progress"])

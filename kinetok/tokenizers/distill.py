@@ -17,11 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import flatten, load_state, save_state, unflatten
 from kinetok.config import ConfigError, at_least
 from kinetok.logger import Logger
+from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
-from kinetok.rl.training import refuse_changed
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.roaming import REACH, Roaming
@@ -108,19 +107,15 @@ def distill(
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
     identity = identify(config, student.config, table.names, seed) | ({"parents": parents} if parents else {})
-    path = out / "state.safetensors"
-    refuse_other_parents(path, parents or {})
+    parts = {"student": student, "optimizer": optimizer, "generator": generator}
+    state = State(out, parts, identity=identity, kinds=KINDS | {"stage": DistillStage})
+    refuse_other_parents(state.path, parents or {})
     step = evaluated = saved = 0
     best: TrackingScore | None = None
     memory = torch.empty(config.memory, env.obs_size)
     labels = torch.empty(config.memory, env.action_size)
-    if path.exists():
-        tensors, meta = load_state(path)
-        refuse_changed(path, meta["identity"], identity, KINDS | {"stage": DistillStage})
-        tree = unflatten(tensors, meta["tree"])
-        student.load_state_dict(tree["student"])
-        optimizer.load_state_dict(tree["optimizer"])
-        generator.set_state(tree["generator"])
+    if before := state.restore():
+        meta = before[0]
         env.load_state_dict(json.loads(meta["env"]))
         step, best = meta["step"], meta.get("score") and TrackingScore.from_json(meta["score"])
         evaluated = saved = step * config.rows
@@ -168,15 +163,8 @@ def distill(
             # Only right after an evaluation, from where its schedule and the episodes' sums start anew.
             if due and (samples - saved >= config.save_every or step == total):
                 saved = samples
-                tensors, skeleton = flatten(
-                    {
-                        "student": dict(student.state_dict()),
-                        "optimizer": optimizer.state_dict(),
-                        "generator": generator.get_state(),
-                    }
-                )
-                meta = {"tree": skeleton, "identity": identity, "step": step, "score": best and best.to_json()}
-                save_state(path, tensors, meta | {"env": json.dumps(env.state_dict())})
+                told = {"step": step, "score": best and best.to_json(), "env": json.dumps(env.state_dict())}
+                state.save(told)
                 obs = torch.from_numpy(env.reset(spread=True))
                 filled = cursor = 0
     student.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())

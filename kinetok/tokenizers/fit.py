@@ -31,9 +31,10 @@ from kinetok.checkpoint import load_artifact, load_state, refuse_foreign, save_a
 from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
+from kinetok.resume import refuse_changed
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import torch_threads
-from kinetok.rl.training import Progress, refuse_changed
+from kinetok.rl.training import Progress
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.distill import DistillStage, distill

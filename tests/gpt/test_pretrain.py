@@ -8,7 +8,8 @@ import pytest
 import torch
 from made import make_clips, make_tokenizer
 
-from kinetok.checkpoint import CheckpointError, load_artifact
+from kinetok import resume
+from kinetok.checkpoint import CheckpointError, load_artifact, load_state
 from kinetok.config import ConfigError
 from kinetok.gpt import pretrain as room
 from kinetok.gpt.controller import Prior
@@ -86,7 +87,7 @@ def test_pretraining_leaves_an_artifact_that_finds_its_tokenizer(tokenizer, toke
 
 def test_a_resumed_run_equals_an_unbroken_one(tokenizer, clips, tmp_path, monkeypatch):
     pretrain(tokenizer, clips, SMALL, tmp_path / "whole", threads=1, quiet=True)
-    saved = room.save_state
+    saved = resume.save_state
 
     def save_and_stop(path, *rest):
         saved(path, *rest)
@@ -94,7 +95,7 @@ def test_a_resumed_run_equals_an_unbroken_one(tokenizer, clips, tmp_path, monkey
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(room, "save_state", save_and_stop)
+        patch.setattr(resume, "save_state", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
             pretrain(tokenizer, clips, SMALL, tmp_path / "broken", threads=1, quiet=True)
     recorded = (tmp_path / "broken" / "tokens.safetensors").stat().st_mtime_ns
@@ -102,7 +103,7 @@ def test_a_resumed_run_equals_an_unbroken_one(tokenizer, clips, tmp_path, monkey
     assert (tmp_path / "broken" / "tokens.safetensors").stat().st_mtime_ns == recorded
     whole, broken = (load_artifact(tmp_path / name) for name in ("whole", "broken"))
     assert whole.hash == broken.hash
-    states = [room.load_state(tmp_path / name / "state.safetensors")[0] for name in ("whole", "broken")]
+    states = [load_state(tmp_path / name / "state.safetensors")[0] for name in ("whole", "broken")]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
     logs = [
@@ -114,7 +115,7 @@ def test_a_resumed_run_equals_an_unbroken_one(tokenizer, clips, tmp_path, monkey
 
 def test_other_settings_are_refused_by_name(tokenizer, clips, tmp_path):
     pretrain(tokenizer, clips, SMALL, tmp_path, threads=1, quiet=True)
-    with pytest.raises(CheckpointError, match=r"config.lr: 0.001 -> 0.1; .* another --out"):
+    with pytest.raises(CheckpointError, match=r"config.lr: 0.001 -> 0.1. .* another --out"):
         pretrain(tokenizer, clips, replace(SMALL, lr=0.1), tmp_path, threads=1, quiet=True)
     with pytest.raises(CheckpointError, match=r"tokens.safetensors: .*config.transitions: 1.0 -> 2.0"):
         pretrain(tokenizer, clips, replace(SMALL, transitions=2.0), tmp_path, threads=1, quiet=True)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from made import make_clips, make_tokenizer
 
+from kinetok import resume
 from kinetok.checkpoint import CheckpointError, load_artifact, load_state
-from kinetok.gpt import refine
 from kinetok.gpt.controller import Prior
 from kinetok.gpt.pretrain import pretrain
 from kinetok.gpt.refine import stayed_up
@@ -71,14 +71,14 @@ def test_a_run_cut_after_a_round_is_the_unbroken_one(made, tmp_path):
     two = replace(tiny_prior(), refine=replace(tiny_prior().refine, rounds=2))
     fit(made, tmp_path / "whole", two)
     with pytest.MonkeyPatch.context() as patch:
-        saves, real = [], refine.save_state
+        saves, real = [], resume.save_state
 
         def cut(path, *args):
             real(path, *args)
             saves.append(path)
             raise KeyboardInterrupt
 
-        patch.setattr(refine, "save_state", cut)
+        patch.setattr(resume, "save_state", cut)
         with pytest.raises(KeyboardInterrupt):
             fit(made, tmp_path / "broken", two)
     fit(made, tmp_path / "broken", two)

@@ -11,10 +11,11 @@ from toy import Aim, Line
 from kinetok.checkpoint import CheckpointError, load_state, save_state
 from kinetok.config import to_dict
 from kinetok.logger import read_metrics
+from kinetok.resume import refuse_changed
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
-from kinetok.rl.training import Training, refuse_changed
+from kinetok.rl.training import Training
 
 ROWS, HORIZON = 16, 4  # 64 samples an iteration
 
