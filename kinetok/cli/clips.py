@@ -1,0 +1,198 @@
+"""Commands about motion and bodies: `kinetok clips ...`, `kinetok characters ...`."""
+
+from pathlib import Path
+
+import click
+
+from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, load_clips, one_clip, option_seed, write_motion
+
+
+@click.group(cls=Chain)
+def clips() -> None:
+    """Look at motion files and gather them into one library."""
+
+
+@clips.command("info")
+@click.argument("paths", nargs=-1, required=True, type=PATHS)
+def clips_info(paths: tuple[Path, ...]) -> None:
+    """Frames, rate, duration and ground clearance of motion files, libraries or folders of them."""
+    from kinetok.motion.character import Character
+    from kinetok.motion.kinematics import lowest_point
+
+    click.echo(f"{'name':<22}{'frames':>7}{'fps':>8}{'seconds':>9}{'loop':>6}{'lowest m':>10}{'path m':>8}  source")
+    for clip in load_clips(paths):
+        low = lowest_point(Character.load(clip.character), clip.qpos).min()
+        steps = ((clip.qpos[1:, :2] - clip.qpos[:-1, :2]) ** 2).sum(1) ** 0.5
+        click.echo(
+            f"{clip.name:<22}{len(clip.qpos):>7}{clip.fps:>8.2f}{clip.seconds:>9.2f}{'yes' if clip.loop else 'no':>6}"
+            f"{low:>z10.3f}{steps.sum():>8.2f}  {clip.source}"
+        )
+
+
+@clips.command("check")
+@click.argument("paths", nargs=-1, required=True, type=PATHS)
+@click.option(
+    "--fix",
+    is_flag=True,
+    default=False,
+    show_default=True,
+    help="Repair what has one right repair and write the rest with it; needs --out.",
+)
+@click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
+@click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
+@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
+def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, fps: float | None) -> None:
+    """Look for what is wrong with motion: lead-ins, jumps, spikes, units, up axis, floor, duplicates.
+
+    What has one right repair is repaired by --fix (and by every command that reads recorded skeletons); the rest is
+    refused with its frame and joint. Exits with 1 where anything was refused.
+    """
+    from kinetok.motion.check import check, report
+    from kinetok.motion.duplicates import duplicates
+    from kinetok.motion.formats import read
+
+    if fix != (out is not None):
+        raise ValueError("--fix writes what it repairs: give both --fix and --out F.safetensors")
+    motions = [motion for path in paths for motion in read(path, fps=fps)]
+    refused = set()
+    for motion in motions:
+        findings = check(motion)
+        refused |= {motion.name} if any(f.severity == "refused" for f in findings) else set()
+        click.echo(f"{motion.name}\n  " + report(findings).replace("\n", "\n  "))
+    for pair in duplicates(motions):
+        part, whole = motions[pair.part].name, motions[pair.whole].name
+        click.echo(f"{part} is in {whole} from {pair.start:.2f} s on{', mirrored' if pair.mirrored else ''}")
+    if out is not None:
+        write_fixed(out, motions, refused, character)
+    if refused:
+        raise click.exceptions.Exit(1)
+
+
+def write_fixed(out: Path, motions: list, refused: set[str], character: str | None) -> None:
+    """A library of the motions that were not refused, mended."""
+    from kinetok.motion.check import mend
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.motion.retarget import retarget
+    from kinetok.motion.skeleton import SkeletonMotion
+
+    check_suffix(out, ".safetensors")
+    mended = [mend(motion)[0] for motion in motions if motion.name not in refused]
+    if not mended:
+        raise ValueError(f"--out {out}: every motion was refused, there is nothing to write")
+    fitted = [retarget(m, character or "humanoid").clip if isinstance(m, SkeletonMotion) else m for m in mended]
+    ClipLibrary.write(out, fitted)
+    click.echo(f"wrote {out}: {len(fitted)} clips; left out: {', '.join(sorted(refused)) or 'none'}")
+
+
+@clips.command("import")
+@click.argument("paths", nargs=-1, required=True, type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
+@click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
+@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
+def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps: float | None) -> None:
+    """Read motion files of any known format and write one memory-mapped library.
+
+    \b
+    BVH, ASF/AMC, AMASS npz, poselib npy          retargeted to --character
+    DeepMimic txt, robot CSV, MimicKit, GMR, ...  of the body they were made for
+    """
+    from kinetok.motion.library import ClipLibrary
+
+    check_suffix(out, ".safetensors")
+    found = load_clips(paths, character, fps)
+    ClipLibrary.write(out, found)
+    click.echo(f"wrote {out}: {len(found)} clips, {sum(c.seconds for c in found):.1f} s")
+
+
+@clips.command("vary")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+@click.option("--seconds", default=60.0, show_default=True, help="Length of the motion.")
+@click.option("--turn", default=60.0, show_default=True, help="Degrees per second it turns at most, to either side.")
+@click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
+@click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
+@option_seed
+def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, seed) -> None:
+    """Make one long motion of a gait cycle: turning, hurrying, lingering, halting.
+
+    \b
+    A prior of straight walks has nothing to choose from; one of varied walks can be steered.
+    kinetok clips vary walk.txt --halt 6 --out walk-varied.safetensors
+    """
+    from kinetok.motion.library import ClipLibrary
+    from kinetok.motion.vary import vary
+
+    check_suffix(out, ".safetensors")
+    varied = vary(one_clip(source, name), seconds=seconds, turn=turn, tempo=tempo, halt=halt, seed=seed)
+    ClipLibrary.write(out, [varied])
+    click.echo(f"wrote {out}: {varied.name}, {varied.seconds:.1f} s")
+
+
+@clips.command("export")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="File to write: .bvh, .csv (robot) or .npz (AMASS-like).")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+def clips_export(source: Path, out: Path, name: str | None) -> None:
+    """Write a clip, recorded or simulated, for Blender (.bvh), a robot (.csv) or SMPL tools (.npz).
+
+    \b
+    .bvh   the character's own joints
+    .csv   of the Unitree G1, at 30 fps
+    .npz   SMPL's joints: the character's directions in the lengths of an average body
+    """
+    check_suffix(out, *EXPORTS)
+    write_motion(out, one_clip(source, name))
+
+
+@clips.command("play")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="Video to write, ending in .mp4.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+@click.option("--seconds", type=float, default=None, help="How much of it; default all, a loop three times.")
+def clips_play(source: Path, out: Path, name: str | None, seconds: float | None) -> None:
+    """Render a motion file to a video, as it was recorded and without physics."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    check_suffix(out, ".mp4")
+    clip = one_clip(source, name)
+    seconds = seconds or clip.seconds * (3 if clip.loop else 1)
+    qpos = clip.at(np.arange(0, seconds, 1 / 30))
+    write_motion(out, replace(clip, qpos=qpos, fps=30.0, loop=False), caption=clip.name)
+
+
+@click.group(cls=Chain)
+def characters() -> None:
+    """Look at characters: the built-in ones, or any MJCF with a roles file (docs/characters.md)."""
+
+
+@characters.command("list")
+def characters_list() -> None:
+    """Names and sizes of the built-in characters."""
+    from kinetok.motion.character import Character
+    from kinetok.motion.character import characters as built_in
+
+    click.echo(f"{'name':<12}{'bodies':>7}{'driven':>8}{'mass kg':>9}{'height m':>10}")
+    for name in built_in():
+        body = Character.load(name)
+        height, mass = body.span(body.stand())[1], body.model.body_mass.sum()
+        click.echo(f"{name:<12}{len(body.body_names):>7}{body.nu:>8}{mass:>9.2f}{height:>10.2f}")
+
+
+@characters.command("show")
+@click.argument("name")
+@click.option("--out", default=None, type=PATHS, help="Also write a picture of it standing, ending in .png.")
+def characters_show(name: str, out: Path | None) -> None:
+    """Facts of a character: NAME is built in, the path of an MJCF, or menagerie:ROBOT."""
+    from kinetok.motion.character import Character
+    from kinetok.render.portrait import describe, write_portrait
+
+    if out is not None:
+        check_suffix(out, ".png")
+    body = Character.load(name)
+    click.echo(describe(body))
+    if out is not None:
+        write_portrait(out, body)
+        click.echo(f"wrote {out}")

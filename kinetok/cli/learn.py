@@ -1,0 +1,77 @@
+"""Commands that train on tokens: `kinetok pretrain`, `kinetok finetune`."""
+
+import click
+
+from kinetok.cli.shared import PATHS, TASK_NAMES, configured, load_clips
+
+
+@click.command()
+@click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
+@click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
+@configured("laptop")
+def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
+    """Train the prior: a GPT over the tokens of the frozen tracker's own roll-outs.
+
+    \b
+    Example: kinetok pretrain --tokenizer runs/walk --clips walk.txt --out runs/prior
+    """
+    from kinetok import presets
+    from kinetok.config import override, pick
+    from kinetok.gpt.pretrain import pretrain as train
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    config = override(pick(presets.PRETRAIN, preset, "preset")(), settings)
+    train(
+        MotionTokenizer.from_pretrained(tokenizer),
+        load_clips(paths),
+        config,
+        out,
+        tokenizer_path=tokenizer,
+        seed=seed,
+        threads=threads,
+    )
+
+
+@click.command()
+@click.option("--prior", default=None, type=PATHS, help="Directory or packaged name.  [default: humanoid-gpt]")
+@click.option("--task", default=None, metavar=TASK_NAMES, help="What to do.  [default: target, or that of --from]")
+@click.option(
+    "--adapter", default=None, metavar="cola|lora|dora|full", help="What bends it.  [default: cola, or that of --from]"
+)
+@click.option("--method", default="rl", show_default=True, help="Of sft,hindsight,rl, in this order.")
+@click.option(
+    "--clips", "paths", multiple=True, type=PATHS, help="Motions for sft and hindsight: file, library or folder."
+)
+@click.option("--from", "start", default=None, type=PATHS, help="A fine-tuned skill whose adapter rl begins with.")
+@click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
+@configured("laptop")
+def finetune(prior, task, adapter, method, paths, start, out, preset, settings, threads, seed) -> None:
+    """Bend the frozen prior to a task with a small adapter: by reward (rl), by examples (sft), or one after the other.
+
+    \b
+    Presets: laptop (2 million steps on two cores), paper (GPC's sizes), tiny (tests).
+    kinetok finetune --task target --out runs/target
+    kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
+    kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
+    kinetok sample --adapter runs/target --out target.mp4
+    """
+    from dataclasses import replace
+
+    from kinetok import presets
+    from kinetok.adapters.finetune import Skill, reshaped
+    from kinetok.adapters.finetune import finetune as bend
+    from kinetok.config import override, pick
+    from kinetok.gpt.controller import Prior
+
+    config = pick(presets.FINETUNE, preset, "preset")()
+    if start is None:
+        base = prior or "humanoid-gpt"
+        model = Prior.from_pretrained(base)
+    else:
+        skill = Skill.from_pretrained(start, prior)
+        model, base = skill.prior, skill.base
+        config = replace(config, task=skill.task, adapter=skill.adapted.config)
+    config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
+    config = override(replace(config, methods=tuple(method.split(","))), settings)
+    bend(model, config, out, base=base, clips=load_clips(paths), start=start, seed=seed, threads=threads)

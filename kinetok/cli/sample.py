@@ -1,0 +1,84 @@
+"""New motion: `kinetok sample`, of a prior or of a skill."""
+
+from pathlib import Path
+
+import click
+
+from kinetok.cli.shared import PATHS, check_suffix, option_seed, show_json, write_motion
+
+
+@click.command()
+@click.option("--prior", default=None, type=PATHS, help="Directory or packaged name.  [default: humanoid-gpt]")
+@click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill to play instead of the prior alone.")
+@click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
+@click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
+@click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
+@click.option(
+    "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: 0.9, or the skill's own]"
+)
+@click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
+@click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
+@click.option("--push", default=0.0, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds.")
+@option_seed
+def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
+    """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics).
+
+    With --adapter the character does its task, and the video shows what is asked of it; the nucleus and the
+    temperature are those it was trained with, unless you say otherwise.
+    """
+    check_suffix(out, ".mp4")
+    drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
+    if adapter is not None:
+        return sample_skill(adapter, prior, tokenizer, out, drawn, seconds=seconds, count=count, push=push, seed=seed)
+    from kinetok.evaluate import measure
+    from kinetok.gpt.controller import Prior, roll
+    from kinetok.motion.clip import Clip
+
+    prior = prior or "humanoid-gpt"
+    drawn = {"top_p": 0.9, "temperature": 1.0} | drawn
+    model = Prior.from_pretrained(prior, tokenizer)
+    character = model.tokenizer.config.character
+    top_p, temperature = drawn["top_p"], drawn["temperature"]
+    recording = roll(model, rows=count, seconds=seconds, top_p=top_p, temperature=temperature, push=push, seed=seed)
+    motion = [
+        Clip(name=f"sample{i}", character=character, fps=recording.fps, qpos=recording.qpos[:, i], source=str(prior))
+        for i in range(count)
+    ]
+    write_motion(out, motion[0])
+    write_motion(out.with_suffix(".safetensors"), *motion)
+    show_json(measure(recording) | {"seed": seed, "prior": str(prior), **drawn}, out.with_suffix(".json"))
+
+
+def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, count, push, seed) -> None:
+    """`sample --adapter`: the first character's video with markers, every character's clip, and the scores.
+
+    drawn: settings of how tokens are drawn that replace the skill's own.
+    """
+    from dataclasses import replace
+
+    from kinetok.adapters.finetune import Skill
+    from kinetok.adapters.rlft import play
+    from kinetok.config import to_dict
+    from kinetok.motion.clip import Clip
+    from kinetok.render.video import render_frames, write_video
+
+    skill = Skill.from_pretrained(adapter, prior, tokenizer)
+    skill = replace(skill, policy=replace(skill.policy, **drawn))
+    played = play(
+        skill.controller(seed), skill.task, skill.prior,
+        episodes=count, seconds=seconds, push=push, seed=seed, record=count,
+    )  # fmt: skip
+    body, name = skill.prior.character, skill.task.kind
+    frames = render_frames(
+        body, played.qpos[:, 0], fps=played.fps, markers=played.markers, caption=name, distance=4.5, elevation=-28
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_video(out, frames, played.fps)
+    click.echo(f"wrote {out}: {len(played.qpos)} frames at {played.fps:g} fps")
+    motion = [
+        Clip(name=f"{name}{i}", character=body.name, fps=played.fps, qpos=played.qpos[:, i], source=str(adapter))
+        for i in range(count)
+    ]
+    write_motion(out.with_suffix(".safetensors"), *motion)
+    told = {"task": name, "push_mps": push, "seed": seed, "adapter": str(adapter)} | to_dict(skill.policy)
+    show_json(played.score.measures | told, out.with_suffix(".json"))

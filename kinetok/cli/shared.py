@@ -1,0 +1,143 @@
+"""What the commands share: options, the group that says errors in one line, reading clips and writing motion."""
+
+import json
+import os
+from pathlib import Path
+
+import click
+
+
+class Chain(click.Group):
+    """Lists commands in the order of the chain, and turns the library's errors into one clear line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context):
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except Exception as error:
+            from kinetok.checkpoint import CheckpointError
+
+            expected = (ValueError, CheckpointError, OSError, FloatingPointError, ImportError)
+            if os.environ.get("KINETOK_TRACEBACK") or not isinstance(error, expected):
+                raise
+            raise click.ClickException(str(error)) from error
+
+
+NATURAL = click.IntRange(min=0)
+option_seed = click.option(
+    "--seed", default=0, show_default=True, type=NATURAL, help="Seeds weights, worlds and noise; the same repeats it."
+)
+option_threads = click.option(
+    "--threads",
+    default=0,
+    show_default=True,
+    type=NATURAL,
+    help="Threads of physics and networks; 0 is every core. Physics is the same at any; a network's sums differ "
+    "in the last bits.",
+)
+
+
+def configured(presets: str):
+    """--preset, --set, --seed and --threads, the same on every training command."""
+
+    def decorate(command):
+        command = option_seed(option_threads(command))
+        command = click.option(
+            "--set",
+            "settings",
+            multiple=True,
+            metavar="KEY=VALUE",
+            help="Change one setting, e.g. teacher.samples=1000000.",
+        )(command)
+        return click.option("--preset", default=presets, show_default=True, help="Where the settings start from.")(
+            command
+        )
+
+    return decorate
+
+
+def load_clips(paths: tuple[Path, ...], character: str | None = None, fps: float | None = None):
+    from kinetok.motion.formats import read_clips
+
+    found = [clip for path in paths for clip in read_clips(path, character, fps=fps)]
+    for clip in found:
+        if "assumed" in clip.source:
+            click.echo(f"{clip.name}: {clip.source}", err=True)
+    return found
+
+
+def check_suffix(out: Path, *allowed: str) -> None:
+    """Refuse a file name before any work is done for it."""
+    if out.suffix not in allowed:
+        raise ValueError(f"--out {out}: the name must end in {' or '.join(allowed)}")
+
+
+def show_json(data: dict, out: Path | None) -> None:
+    text = json.dumps(data, indent=1)
+    if out is None:
+        click.echo(text)
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.tmp")
+    temporary.write_text(text + "\n")
+    temporary.replace(out)
+    click.echo(f"wrote {out}")
+
+
+PATHS = click.Path(path_type=Path)
+EXPORTS = (".bvh", ".csv", ".npz")  # of programs other than this one
+TASK_NAMES = "target|steering|path"
+
+
+def one_clip(source: Path, name: str | None):
+    """The clip of that name in a file or library, or its only one."""
+    from kinetok.config import nearest
+
+    found = load_clips((source,))
+    names = [clip.name for clip in found]
+    if name is None and len(found) > 1:
+        raise ValueError(f"{source} holds {len(found)} clips; choose one with --name: {', '.join(names[:12])}")
+    if name is not None and name not in names:
+        raise ValueError(f"{source} holds no clip {name!r}{nearest(name, names)}")
+    return found[names.index(name) if name else 0]
+
+
+def write_motion(out: Path, *clips, caption: str = "") -> None:
+    """Write clips as a library, or one clip as a video or for other programs, by the file's suffix."""
+    from dataclasses import replace
+
+    from kinetok.motion.character import Character
+    from kinetok.motion.export import skeleton_motion, smpl_motion
+    from kinetok.motion.formats.amass import write_amass
+    from kinetok.motion.formats.bvh import write_bvh
+    from kinetok.motion.formats.robot_csv import write_robot_csv
+    from kinetok.motion.library import ClipLibrary
+
+    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
+    clip, *others = clips
+    character = Character.load(clip.character)
+    if out.suffix == ".safetensors":
+        ClipLibrary.write(out, clips)
+    elif others:
+        raise ValueError(f"--out {out}: {len(clips)} clips; of the files written here only .safetensors holds many")
+    elif out.suffix == ".mp4":
+        from kinetok.render.video import render_frames, write_video
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_video(out, render_frames(character, clip.qpos, fps=clip.fps, caption=caption), clip.fps)
+    elif out.suffix == ".bvh":
+        write_bvh(out, skeleton_motion(character, clip))
+    elif out.suffix == ".npz":
+        write_amass(out, smpl_motion(character, clip))
+    else:
+        if abs(clip.fps / 30 - 1) > 1e-3:  # the file carries no rate
+            clip = replace(clip, loop=False).resample(30.0)
+        write_robot_csv(out, clip)
+    told = f"{len(clip.qpos)} frames at {clip.fps:g} fps"
+    if others:
+        told = f"{len(clips)} clips, {sum(c.seconds for c in clips):.1f} s"
+    click.echo(f"wrote {out}: {told}")

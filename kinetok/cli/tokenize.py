@@ -1,0 +1,68 @@
+"""Commands about tokens: `kinetok tokenize fit|encode|decode`."""
+
+import click
+
+from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, configured, load_clips, write_motion
+
+
+@click.group(cls=Chain)
+def tokenize() -> None:
+    """Learn motion tokens through physics, and use them."""
+
+
+@tokenize.command("fit")
+@click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
+@click.option("--stages", default=None, help="Of teacher,distill,ppo; ppo alone is the paper's end-to-end form.")
+@configured("one-clip")
+def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
+    """Train a tokenizer: encoder, FSQ bottleneck and decoder, through the simulated tracking loop.
+
+    \b
+    Presets: one-clip (minutes), many-clips (hours), from-scratch (end-to-end PPO alone), tiny (tests).
+    Example: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
+    """
+    from kinetok import presets
+    from kinetok.config import override, pick
+    from kinetok.tokenizers.fit import fit
+
+    if stages:
+        settings = (*settings, f"stages={stages}")
+    config = override(pick(presets.FIT, preset, "preset")(), settings)
+    fit(load_clips(paths), config, out, seed=seed, threads=threads)
+
+
+@tokenize.command("encode")
+@click.argument("clip", type=PATHS)
+@click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
+@click.option("--out", required=True, type=PATHS, help="Token file to write, ending in .safetensors.")
+@click.option("--seconds", type=float, default=None, help="How long to track; default once through the clip.")
+def tokenize_encode(clip, tokenizer, out, seconds) -> None:
+    """Write the tokens of a clip: (T, S) int64, one row per control step, with their layout."""
+    from kinetok.tokenizers.codec import encode_clip
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    check_suffix(out, ".safetensors")
+    found = load_clips((clip,))
+    if len(found) > 1:
+        raise ValueError(f"{clip} holds {len(found)} clips; encode one at a time")
+    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), found[0], seconds=seconds)
+    stream.save(out)
+    click.echo(f"wrote {out}: tokens {tuple(stream.tokens.shape)}, {stream.layout}")
+
+
+@tokenize.command("decode")
+@click.argument("tokens", type=PATHS)
+@click.option("--tokenizer", required=True, type=PATHS, help="The tokenizer that wrote the tokens.")
+@click.option("--out", required=True, type=PATHS, help=".safetensors (clip library), .mp4, .bvh, .csv or .npz.")
+def tokenize_decode(tokens, tokenizer, out) -> None:
+    """Play tokens in simulation from their first state; no reference is involved."""
+    from kinetok.motion.clip import Clip
+    from kinetok.tokenizers.codec import TokenStream, decode_tokens
+    from kinetok.tokenizers.tokenizer import MotionTokenizer
+
+    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
+    stream = TokenStream.load(tokens)
+    model = MotionTokenizer.from_pretrained(tokenizer)
+    qpos, character = decode_tokens(model, stream), model.config.character
+    write_motion(out, Clip(name=stream.name, character=character, fps=stream.fps, qpos=qpos, source="simulated"))
