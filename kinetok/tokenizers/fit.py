@@ -230,7 +230,7 @@ def _taught_numbers(folder: Path, names: Sequence[str], teachers: int) -> np.nda
     numbers = np.full((len(names), 2), np.nan)
     for k in range(len(names)):
         state = folder / names[k % teachers] / "state.safetensors"
-        if state.exists() and (score := load_state(state)[1]["progress"]["score"]):
+        if state.exists() and (score := load_state(state)[1]["progress"].get("score")):
             numbers[k] = score["success"][0], score["mpjpe_mm"][0]
     return numbers
 
