@@ -109,15 +109,16 @@ class Target:
         """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
         heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
 
-        The target is where the root was after a random time of up to tau_reset, if it went there at half a metre a
-        second or more on the straight line, or stayed near.
+        The target is where the root was after a random time of half a second to the longest tau_reset, or to where the
+        path ends, if it went there at half a metre a second or more on the straight line, or stayed near.
         """
-        steps, now = self.control_hz, np.arange(len(root))[:, None]
-        ahead = now + rng.integers(steps // 2, round(self.config.seconds[1] * steps), heading.shape)
+        hz, now = self.control_hz, np.arange(len(root))[:, None]
+        longest = np.minimum(ends - now, round(self.config.seconds[1] * hz))
+        ahead = now + hz // 2 + (rng.random(heading.shape) * (longest - hz // 2 + 1)).astype(int)
         offset = later(root, ahead) - root
         distance = np.hypot(offset[..., 0], offset[..., 1])
-        brisk = distance > 0.5 * (ahead - now) / steps
-        return from_heading(offset, heading), (ahead <= ends) & (brisk | (distance < self.config.near))
+        brisk = distance > 0.5 * (ahead - now) / hz
+        return from_heading(offset, heading), (longest >= hz // 2) & (brisk | (distance < self.config.near))
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""
