@@ -61,6 +61,7 @@ def draw(
     generator: torch.Generator | None = None,
     top_p: float = 0.9,
     temperature: float = 1.0,
+    guidance: float = 1.0,
     greedy: bool = False,
     caches: tuple[KVCache, KVCache] | None = None,
 ) -> Drawn:
@@ -88,8 +89,9 @@ def draw(
         h = adapted.begin(state, c, for_bent) if j == 0 else adapted.advance(tokens[:, j - 1], for_bent)
         y, token = adapted.head.begin(h), 0
         for d in range(choices):
-            kept = nucleus(base.head.logits(x, d) / temperature, top_p)
-            logits = restrict(adapted.head.logits(y, d) / temperature, kept)
+            plain = base.head.logits(x, d) / temperature
+            kept = nucleus(plain, top_p)
+            logits = restrict(guided(plain, adapted.head.logits(y, d) / temperature, guidance), kept)
             chosen = logits.argmax(-1) if uniform is None else option_at(logits, uniform[:, j, d])
             log_prob[:, j] += logits.gather(-1, chosen[:, None]).squeeze(-1) - logits.logsumexp(-1)
             keep[:, j, d], token = kept, token * options + chosen
@@ -106,6 +108,7 @@ def score(
     keep: Tensor,
     *,
     temperature: float = 1.0,
+    guidance: float = 1.0,
     reference: bool = False,
 ) -> Scored:
     """What the policy says now of tokens (N, S) drawn with the mask keep (N, S, D, K), differentiably.
@@ -113,16 +116,28 @@ def score(
     One teacher-forced pass; reference: with the KL from the base, at the cost of a second without gradient.
     """
     _check(adapted, temperature)
-    log_p = F.log_softmax(restrict(adapted(state, c, tokens) / temperature, keep), dim=-1)
+    logits, plain = adapted(state, c, tokens) / temperature, None
+    if reference or guidance != 1.0:
+        with torch.no_grad():
+            plain = adapted.base(state, tokens) / temperature
+        logits = guided(plain, logits, guidance)
+    log_p = F.log_softmax(restrict(logits, keep), dim=-1)
     taken = log_p.gather(-1, adapted.base.split(tokens)[..., None])
     log_p = log_p.masked_fill(~keep, 0.0)  # where p = 0: p log p is 0, not nan
     p = log_p.exp() * keep
     kl = None
-    if reference:
-        with torch.no_grad():
-            log_q = F.log_softmax(restrict(adapted.base(state, tokens) / temperature, keep), dim=-1)
+    if reference and plain is not None:
+        log_q = F.log_softmax(restrict(plain, keep), dim=-1)
         kl = (p * (log_p - log_q.masked_fill(~keep, 0.0))).sum((1, 2, 3))
     return Scored(log_prob=taken.sum((1, 2, 3)), entropy=-(p * log_p).sum((1, 2, 3)), kl=kl)
+
+
+def guided(plain: Tensor, bent: Tensor, guidance: float) -> Tensor:
+    """Logits that go `guidance` times as far from those of the base as the adapted ones do.
+
+    Classifier-free guidance (Ho and Salimans 2021), with the base as the model that knows no condition.
+    """
+    return bent if guidance == 1.0 else plain + guidance * (bent - plain)
 
 
 def _check(adapted: Adapted, temperature: float) -> None:

@@ -35,18 +35,19 @@ Controller = Callable[[Tensor], Tensor]  # observations (N, O) -> PD targets (N,
 class TokenPolicyConfig:
     """top_p: mass of the frozen prior's nucleus, 1 for no bound; temperature: divides the logits (GPC table 12); kl:
     weight of the divergence from the prior in the loss, nats a step; entropy: weight of the bonus (NCP: top_p 1,
-    kl 0.05, entropy 0.01)."""
+    kl 0.05, entropy 0.01); guidance: how many times as far as the adapter says its logits go from the prior's."""
 
     top_p: float = 0.9
     temperature: float = 1.0
     kl: float = 0.0
     entropy: float = 0.0
+    guidance: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.top_p <= 1.0:
             raise ConfigError(f"top_p must lie in (0, 1], not {self.top_p}; 1 keeps every token")
-        if not (self.temperature > 0.0 and self.kl >= 0.0 and self.entropy >= 0.0):
-            raise ConfigError(f"a temperature is above 0, the weights kl and entropy are not below it: {self}")
+        if not (self.temperature > 0.0 and self.kl >= 0.0 and self.entropy >= 0.0 and self.guidance >= 0.0):
+            raise ConfigError(f"a temperature is above 0; kl, entropy and guidance are not below it: {self}")
 
 
 class TokenPolicy:
@@ -69,6 +70,7 @@ class TokenPolicy:
             generator=generator,
             top_p=self.config.top_p,
             temperature=self.config.temperature,
+            guidance=self.config.guidance,
             greedy=generator is None,
             caches=self._caches,
         )
@@ -84,6 +86,7 @@ class TokenPolicy:
             taken["tokens"],
             taken["keep"],
             temperature=config.temperature,
+            guidance=config.guidance,
             reference=config.kl > 0,
         )
         entropy = found.entropy.mean()

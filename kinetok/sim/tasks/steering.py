@@ -22,6 +22,8 @@ from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import GOAL, SIDE, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
+AHEAD = 1.5  # seconds that hindsight looks ahead at most
+
 
 @dataclass(frozen=True, kw_only=True)
 class SteeringConfig:
@@ -120,12 +122,12 @@ class Steering:
         """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
         heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
 
-        The command is the mean velocity over half a second to the shortest command, and the facing is the one that
-        the body had then.
+        The command is the mean velocity of a third of a second, up to AHEAD seconds later, and the facing that of its
+        end: what the body does now says little about what comes much later.
         """
         hz, now = self.control_hz, np.arange(len(root))[:, None]
-        ahead = now + rng.integers(hz // 2, max(round(self.config.seconds[0] * hz), hz // 2 + 1), heading.shape)
-        velocity = (later(root, ahead) - root) * (hz / (ahead - now))[..., None]
+        ahead = now + rng.integers(hz // 2, round(AHEAD * hz) + 1, heading.shape)
+        velocity = (later(root, ahead) - later(root, ahead - hz // 3)) * (hz / (hz // 3))
         facing = direction(later(heading, ahead))
         c = np.concatenate([from_heading(velocity, heading), from_heading(facing, heading)], axis=-1)
         return c, ahead <= ends

@@ -19,6 +19,9 @@ from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import DONE, GOAL, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
+AHEAD = 2.0  # seconds that hindsight looks ahead at most
+WALKING, RESTING = 0.4, 0.15  # m/s over half a second
+
 
 @dataclass(frozen=True, kw_only=True)
 class TargetConfig:
@@ -109,16 +112,22 @@ class Target:
         """Task observations (T, N, C) that a motion fulfilled, and where there is one (T, N): root (T, N, 2) metres and
         heading (T, N) radians of what was done; ends (T, N): the last step that step t may look ahead to.
 
-        The target is where the root was after a random time of half a second to the longest tau_reset, or to where the
-        path ends, if it went there at half a metre a second or more on the straight line, or stayed near.
+        The target is on the way that the root took after half a second to AHEAD seconds: as far on, straight, as
+        one may be asked to go. Where the root came to rest it is there. A target is not where the root came much later,
+        because what it does now says little about that.
         """
         hz, now = self.control_hz, np.arange(len(root))[:, None]
-        longest = np.minimum(ends - now, round(self.config.seconds[1] * hz))
+        longest = np.minimum(ends - now, round(AHEAD * hz))
         ahead = now + hz // 2 + (rng.random(heading.shape) * (longest - hz // 2 + 1)).astype(int)
-        offset = later(root, ahead) - root
-        distance = np.hypot(offset[..., 0], offset[..., 1])
-        brisk = distance > 0.5 * (ahead - now) / hz
-        return from_heading(offset, heading), (longest >= hz // 2) & (brisk | (distance < self.config.near))
+        there = later(root, ahead)
+        velocity = (there - later(root, ahead - hz // 2)) * 2
+        speed = np.hypot(velocity[..., 0], velocity[..., 1])[..., None]
+        on = np.where(speed > WALKING, velocity / speed.clip(1e-6), 0.0) * rng.uniform(
+            0, self.config.distance[1], (*heading.shape, 1)
+        )
+        rests = (speed[..., 0] < RESTING) & (np.linalg.norm(there - root, axis=-1) < self.config.near)
+        told = (longest >= hz // 2) & (rests | (speed[..., 0] > WALKING))
+        return from_heading((there - root + on).astype(np.float32), heading), told
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""
