@@ -7,9 +7,10 @@ the following seconds fulfilled (a target it reached, a velocity it had, a path 
 cross-entropy to choose the tokens that were chosen, given that observation. No reward and no critic: the variety of
 the motion is the teacher. Steps before a fall are left out, so that what remains upright is learned.
 
-Two sources of motion: recorded clips, which the frozen tokenizer tracks (`demonstrate`), and the policy itself, which
-plays the task round after round. Clips that turn and halt on purpose say far more about where tokens lead than what
-a prior draws at random, whose turns cancel within a second.
+Two sources of motion: recorded clips, which the frozen tokenizer tracks, and the policy itself, which plays the task
+round after round. Clips that turn and halt on purpose say far more about where tokens lead than what a prior draws at
+random, whose turns cancel within a second. They say most when they are played as the task asks, by motion matching
+(`matching`): then nothing has to be relabelled, and what is learned depends on what was asked and not on the state.
 
 Goal-conditioned supervised learning (Ghosh et al. 2021, "Learning to reach goals via iterated supervised
 learning"; of demonstrations, Ding et al. 2019, "Goal-conditioned imitation learning"), which GPC does not use:
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from kinetok import rotation
 from kinetok.adapters.adapted import AdapterPart
+from kinetok.adapters.guide import demonstrate
 from kinetok.adapters.rlft import TokenPolicy
 from kinetok.config import to_dict
 from kinetok.gpt.data import Rollout, before_failure, roam
@@ -44,8 +46,9 @@ S = TypeVar("S", bound=Score)
 class HindsightConfig:
     """rounds: of learning, each of `iterations` of `batch` samples at lr, falling to a tenth over all rounds; rows,
     seconds: of the task played before each round, but for the first where there are clips; memory: rounds whose samples
-    are kept; samples: control steps of tracked clips, which are kept all the time; code_noise, transitions, env: of the
-    tracking, as in recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors:
+    are kept; samples: control steps of tracked clips, which are kept all the time; matching: the clips are played as the
+    task asks, by motion matching (guide.py), and not as they are; code_noise, transitions, env: of the tracking, as in
+    recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors:
     directions of what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are
     alike; boost: at most so much more often."""
 
@@ -58,6 +61,7 @@ class HindsightConfig:
     memory: int = 2
     samples: int = 200_000
     code_noise: float = 0.05
+    matching: bool = True
     transitions: float = 0.1
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.3, episode_seconds=20.0)
     doomed: float = 1.5
@@ -95,16 +99,16 @@ def hindsight(
         meta, kept = before
         memory, done, best = [tuple(part) for part in kept["memory"]], meta["round"], meta["best"]
     total = config.rounds * config.iterations
-    demonstrated = []
+    lessons = []
     if table is not None and done < config.rounds:
-        demonstrated = [relabel(demonstrate(policy, table, config, seed, threads, quiet), env, config, seed)]
+        lessons = [demonstrated(policy, env, table, config, seed, threads, quiet)]
     with Logger(out, total=total, title="hindsight", start=done * config.iterations, quiet=quiet) as log:
         for number in range(done, config.rounds):
             env.rng = np.random.default_rng([seed, number])
-            if number or not demonstrated:
+            if number or not lessons:
                 memory = [*memory, relabel(play_on(policy, env, config, generator), env, config, seed + number)]
                 memory = memory[-config.memory :]
-            seen, c, tokens, weight = (torch.cat(parts) for parts in zip(*demonstrated, *memory, strict=True))
+            seen, c, tokens, weight = (torch.cat(parts) for parts in zip(*lessons, *memory, strict=True))
             adapted.observe(c)
             for iteration in range(config.iterations):
                 step = number * config.iterations + iteration
@@ -152,22 +156,16 @@ def play_on(policy: TokenPolicy, env: Env, config: HindsightConfig, generator: t
     return played
 
 
-def demonstrate(
-    policy: TokenPolicy, table: ReferenceTable, config: HindsightConfig, seed: int, threads: int, quiet: bool
-) -> Rollout:
-    """`samples` control steps of the frozen tokenizer on the table's clips."""
-    return roam(
-        policy.tokenizer,
-        table,
-        samples=config.samples,
-        rows=config.rows,
-        seed=seed,
-        threads=threads,
-        env=config.env,
-        transitions=config.transitions,
-        code_noise=config.code_noise,
-        quiet=quiet,
-    )
+def demonstrated(
+    policy: TokenPolicy, env: Env, table: ReferenceTable, config: HindsightConfig, seed: int, threads: int, quiet: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What `relabel` returns, of the frozen tokenizer on the table's clips: matched to the task, or as they are."""
+    told = {"samples": config.samples, "rows": config.rows, "seed": seed, "threads": threads, "quiet": quiet}
+    told |= {"env": config.env, "code_noise": config.code_noise}
+    if config.matching:
+        states, c, tokens = demonstrate(policy.tokenizer, table, env.task, doomed=config.doomed, **told)
+        return states, c, tokens, torch.ones(len(states))
+    return relabel(roam(policy.tokenizer, table, transitions=config.transitions, **told), env, config, seed)
 
 
 def relabel(rolled: Rollout, env: Env, config: HindsightConfig, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

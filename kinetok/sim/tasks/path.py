@@ -131,6 +131,12 @@ class Path:
             parts.append(from_heading(later(root, ahead) - root, heading))
         return np.concatenate(parts, axis=-1), now + self.config.waypoints * self.arc <= ends
 
+    def wish(self, c: np.ndarray) -> np.ndarray:
+        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, C)."""
+        points = c.reshape(len(c), -1, 2)
+        nearest = min(max(round(self.control_hz / self.arc), 1), points.shape[1])
+        return points[:, nearest - 1] * (self.control_hz / (self.arc * nearest))
+
     def markers(self, row: int) -> list[Marker]:
         """Balls along the path, larger where a waypoint is, and a disc where the root should be now."""
         dots = [

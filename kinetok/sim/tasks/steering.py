@@ -132,6 +132,10 @@ class Steering:
         c = np.concatenate([from_heading(velocity, heading), from_heading(facing, heading)], axis=-1)
         return c, ahead <= ends
 
+    def wish(self, c: np.ndarray) -> np.ndarray:
+        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 4)."""
+        return c[:, :2]
+
     def markers(self, row: int) -> list[Marker]:
         """On the floor an arrow to where the root should be in a second; above the head a small one to the facing."""
         x, y, z = self.world.root[row].tolist()

@@ -21,6 +21,7 @@ from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_hea
 
 AHEAD = 2.0  # seconds that hindsight looks ahead at most
 WALKING, RESTING = 0.4, 0.15  # m/s over half a second
+STRIDE = 1.2  # metres that a demonstration wants to come nearer in a second
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +129,10 @@ class Target:
         rests = (speed[..., 0] < RESTING) & (np.linalg.norm(there - root, axis=-1) < self.config.near)
         told = (longest >= hz // 2) & (rests | (speed[..., 0] > WALKING))
         return from_heading((there - root + on).astype(np.float32), heading), told
+
+    def wish(self, c: np.ndarray) -> np.ndarray:
+        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 2)."""
+        return c * (STRIDE / length(c).clip(STRIDE))[:, None]
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""

@@ -1,0 +1,61 @@
+"""Matching: tracking that goes on, a few times a second, where the recorded motion does what is wished for.
+
+    task = Matching(TrackingConfig(), table, rows=256, rng=rng)
+    task.wish[:] = (1.0, 0.5)                       # metres, in a second from now, seen from the root: ahead, left
+    step = env.step(action)
+    task.land(env, step.obs)
+
+Motion matching (Clavet 2016, "Motion matching and the road to next-gen animation") as a demonstrator: of all frames
+that resemble the body, a row goes on in the one whose own next second comes nearest to the wish, unless the clip it is
+in does as well. The tracker that follows shows what tokens such a wish takes.
+"""
+
+import numpy as np
+
+from kinetok import rotation
+from kinetok.sim.batch import BodyState
+from kinetok.sim.tasks.roaming import Roaming, likeness
+from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
+
+SEARCHES = 2.5  # a second, each row at moments of its own
+LIKENESS = 4.0  # weight of the squared likeness, against the squared metres by which a wish is missed
+MARGIN = 0.02  # square metres by which another frame must be better
+
+
+class Matching(Roaming):
+    """wish (rows, 2): where the root should be in a second, in metres in its heading frame."""
+
+    def __init__(
+        self,
+        config: TrackingConfig,
+        table: ReferenceTable,
+        *,
+        rows: int,
+        rng: np.random.Generator,
+        reach: float = 0.35,
+    ):
+        super().__init__(config, table, rows=rows, transitions=SEARCHES, rng=rng, reach=reach, reach_at_end=2 * reach)
+        self.wish = np.zeros((rows, 2), np.float32)
+        last = np.repeat(table.last, table.last - table.first + 1)
+        ahead = np.arange(len(last)) + table.control_hz
+        step = np.concatenate(
+            [table.root[np.minimum(ahead, last), :2] - table.root[:, :2], np.zeros((len(last), 1))], 1
+        )
+        self.second = rotation.turn(step, np.cos(table.heading), -np.sin(table.heading))[:, :2].astype(np.float32)
+        self._whole = ahead <= last
+
+    def _nearest(self, body: BodyState, ids: np.ndarray, left: np.ndarray) -> np.ndarray:
+        entries = self._entries
+        squares = entries.squares(likeness(body))
+        missed = self.second[entries.frames] - self.wish[ids][:, None]
+        cost = LIKENESS * squares + np.einsum("nek,nek->ne", missed, missed)
+        beside = np.abs(entries.frames - self.frame[ids][:, None]) < self.tail
+        near = np.where(left[:, None] <= 0, self._reach_at_end, self._reach) ** 2
+        cost[(squares > near) | ~self._whole[entries.frames] | (beside & (entries.owner == self.clip[ids, None]))] = (
+            np.inf
+        )
+        best = cost.argmin(1)
+        stay = ((self.second[self.frame[ids]] - self.wish[ids]) ** 2).sum(1)
+        stay[left <= self.tail] = np.inf
+        lowest = cost[np.arange(len(ids)), best]
+        return np.where(np.isfinite(lowest) & (lowest < stay - MARGIN), entries.frames[best], -1)
