@@ -20,7 +20,7 @@ reinforcement learning goes on from there.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -37,6 +37,7 @@ from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import Score
 from kinetok.sim.env import Env, EnvConfig
+from kinetok.sim.tasks import Goal
 from kinetok.sim.tasks.tracking import ReferenceTable
 
 S = TypeVar("S", bound=Score)
@@ -46,11 +47,11 @@ S = TypeVar("S", bound=Score)
 class HindsightConfig:
     """rounds: of learning, each of `iterations` of `batch` samples at lr, falling to a tenth over all rounds; rows,
     seconds: of the task played before each round, but for the first where there are clips; memory: rounds whose samples
-    are kept; samples: control steps of tracked clips, which are kept all the time; matching: the clips are played as the
-    task asks, by motion matching (guide.py), and not as they are; code_noise, transitions, env: of the tracking, as in
-    recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors:
-    directions of what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are
-    alike; boost: at most so much more often."""
+    are kept; samples: control steps of tracked clips, which are kept all the time; matching: the clips are played as
+    the task asks, by motion matching (guide.py), and not as they are; code_noise, transitions, env: of the tracking, as
+    in recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors: directions of
+    what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are alike; boost: at
+    most so much more often."""
 
     rounds: int = 4
     rows: int = 512
@@ -163,7 +164,7 @@ def demonstrated(
     told = {"samples": config.samples, "rows": config.rows, "seed": seed, "threads": threads, "quiet": quiet}
     told |= {"env": config.env, "code_noise": config.code_noise}
     if config.matching:
-        states, c, tokens = demonstrate(policy.tokenizer, table, env.task, doomed=config.doomed, **told)
+        states, c, tokens = demonstrate(policy.tokenizer, table, cast(Goal, env.task), doomed=config.doomed, **told)
         return states, c, tokens, torch.ones(len(states))
     return relabel(roam(policy.tokenizer, table, transitions=config.transitions, **told), env, config, seed)
 
