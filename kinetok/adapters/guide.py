@@ -8,6 +8,8 @@ fine-tuning learns. A row that goes on in another clip has its body moved there 
 where it would be without that.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -61,12 +63,15 @@ def demonstrate(
     env: EnvConfig | None = None,
     code_noise: float = 0.05,
     doomed: float = 1.0,
+    driver: Callable[[Tensor], Tensor] | None = None,
     quiet: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """states (M, S), task observations (M, C) and tokens (M, K) of what was followed for `samples` control steps.
 
     goal: of as many rows. doomed: seconds before a failure that are left out. code_noise: as in recording for a prior.
-    The result depends on `seed` and not on `threads`.
+    driver: who acts instead of the tokenizer in every second row, from states and task observations (N, S + C) to PD
+    targets; the tokenizer's tokens remain the lesson, so that it says how to go on from where the driver's choices lead
+    (DAgger, Ross et al. 2011). The result depends on `seed` and not on `threads`.
     """
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 5])
@@ -92,7 +97,10 @@ def demonstrate(
             codes = tokenizer.encode(seen)
             states[t], c[t], tokens[t] = seen[:, part], torch.from_numpy(asking), layout.to_tokens(codes)
             played = jitter(codes, code_noise, tokenizer.quantizer.levels[0], rng) if code_noise else codes
-            step = world.step(tokenizer.decode(played, seen[:, part]).numpy())
+            action = tokenizer.decode(played, seen[:, part])
+            if driver is not None:
+                action[::2] = driver(torch.cat([states[t], c[t]], 1)[::2])
+            step = world.step(action.numpy())
             terminated[t], obs = step.terminated, step.obs
             done[t, step.done] = True
             # A row that ended begins anew where it was; one that lands has come to where its body is now.
