@@ -40,7 +40,7 @@ def one_clip() -> FitConfig:
 def many_clips() -> FitConfig:
     """Dozens of motions in hours on two cores: an expert per clip, robust to pushes, and a wider student."""
     return FitConfig(
-        tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=24, levels=9), encoder=(512, 256), decoder=(512, 256)),
+        tokenizer=TokenizerConfig(quantizer=FSQConfig(dim=12, levels=9), encoder=(512, 256), decoder=(512, 256)),
         teacher=PPOStage(
             samples=2_000_000,
             stop_success=1.0,
@@ -48,8 +48,9 @@ def many_clips() -> FitConfig:
             patience=3,
             env=EnvConfig(reset_noise=0.02, push=0.5),
         ),
-        distill=DistillStage(samples=1_500_000, rows=512, minibatch=2048, memory=262_144, eval_every=150_000,
-                             eval_episodes=4, env=EnvConfig(reset_noise=0.02, push=1.0)),
+        distill=DistillStage(samples=5_000_000, rows=512, updates=2, minibatch=1024, memory=262_144, transitions=0.15,
+                             reach_at_end=0.6, eval_every=500_000, eval_episodes=4, save_every=1_000_000,
+                             env=EnvConfig(reset_noise=0.02, push=0.5)),
     )  # fmt: skip
 
 
@@ -92,7 +93,13 @@ FIT = {"one-clip": one_clip, "many-clips": many_clips, "from-scratch": from_scra
 def laptop() -> PretrainConfig:
     """A prior in a quarter of an hour on two cores."""
     return PretrainConfig(
-        width=128, layers=3, samples=300_000, iterations=2500, batch=512, code_noise=0.05, refine=RefineConfig()
+        width=128,
+        layers=3,
+        samples=500_000,
+        code_noise=0.05,
+        reach_at_end=0.6,
+        env=EnvConfig(reset_noise=0.02, push=0.3),
+        refine=RefineConfig(rounds=4),
     )
 
 
