@@ -29,6 +29,7 @@ from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
+from kinetok.sim.tasks.matching import Matching
 from kinetok.sim.tasks.roaming import REACH, Roaming
 from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -166,13 +167,21 @@ def roam(
     transitions: float = 0.3,
     code_noise: float = 0.0,
     reach_at_end: float = REACH,
+    wander: float = 0.0,
     quiet: bool = False,
 ) -> Rollout:
-    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; arguments as of `record`."""
+    """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; arguments as of `record`.
+
+    wander: seconds on average after which each row wants to go where a random frame of its clip goes
+    (sim.tasks.matching); 0 follows the clips as they are.
+    """
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 1])
     tracking = TrackingConfig(future=tokenizer.config.future)
-    task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng, reach_at_end=reach_at_end)
+    if wander:
+        task = Matching(tracking, table, rows=rows, rng=rng)
+    else:
+        task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng, reach_at_end=reach_at_end)
     task.weights = ClipWeights(len(table.names), rate=1.0, bounds=(0.0, np.inf))  # whatever fails
     task.weights.values = clip_weights(table)
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
@@ -182,6 +191,10 @@ def roam(
     log = Logger(None, total=samples, title="record", quiet=quiet)
     with torch.no_grad(), torch_threads(1), log:
         for t in range(steps):
+            if isinstance(task, Matching):
+                new = np.flatnonzero((t == 0) | (rng.random(rows) < 1 / (wander * scene.control_hz)))
+                first, cycle = table.first[task.clip[new]], table.cycle[task.clip[new]]
+                task.wish[new] = task.second[first + (rng.random(len(new)) * cycle).astype(int)]
             seen = torch.from_numpy(obs)
             codes = tokenizer.encode(seen)
             rolled.states[t], rolled.tokens[t] = seen[:, part], layout.to_tokens(codes)
@@ -200,8 +213,10 @@ def record(
     tokenizer: MotionTokenizer,
     table: ReferenceTable,
     *,
+    samples: int = 400_000,
     rows: int = 256,
     seed: int = 0,
+    wander: float = 0.0,
     **settings: Any,
 ) -> TokenDataset:
     """Roll the frozen tokenizer out for `samples` control steps over `rows` worlds; what went well is the data.
@@ -209,21 +224,28 @@ def record(
     settings: of `roam`. env: pushes, noise and episode length; the physics is the tokenizer's own. code_noise: share of
     the scalars whose executed code is one level off while the recorded one is not, so that the data shows how to go on
     from the states that a prior's own imprecise choices lead to (noise injection, DART: Laskey et al. 2017).
-    transitions, reach_at_end: see `Roaming`. The result depends on `seed` and not on `threads`.
+    transitions, reach_at_end: see `Roaming`. wander: where it is above 0, half of the samples are of rows whose wishes
+    change after so many seconds, so that one state goes on in many ways. The result depends on `seed` and not on
+    `threads`.
     """
-    rolled = roam(tokenizer, table, rows=rows, seed=seed, **settings)
-    good = ~before_failure(rolled.terminated, rolled.cut, round(BEFORE_FAILURE * tokenizer.config.scene.control_hz))
-    if not good.any():
+    shares = [0.0, wander] if wander else [0.0]
+    parts = [
+        roam(tokenizer, table, samples=samples // len(shares), rows=rows, seed=seed + 7919 * i, wander=w, **settings)
+        for i, w in enumerate(shares)
+    ]
+    steps = round(BEFORE_FAILURE * tokenizer.config.scene.control_hz)
+    good = [torch.from_numpy(~before_failure(part.terminated, part.cut, steps)) for part in parts]
+    if not torch.cat(good).any():
         raise ValueError(
             f"the tokenizer follows none of {', '.join(table.names)} for more than {BEFORE_FAILURE} s, so there is "
             "nothing to learn from; look at `kinetok evaluate` of the tokenizer, and fit it longer"
         )
-    kept = torch.from_numpy(good.ravel())
+    worlds = [torch.arange(rows, dtype=torch.int32).repeat(len(part.cut), 1) for part in parts]
     return TokenDataset(
-        states=rolled.states.flatten(0, 1)[kept],
-        tokens=rolled.tokens.flatten(0, 1)[kept],
-        clip=torch.from_numpy(rolled.clip.ravel())[kept],
-        world=torch.arange(rows, dtype=torch.int32).repeat(len(rolled.cut))[kept],
+        states=torch.cat([part.states[kept] for part, kept in zip(parts, good, strict=True)]),
+        tokens=torch.cat([part.tokens[kept] for part, kept in zip(parts, good, strict=True)]),
+        clip=torch.cat([torch.from_numpy(part.clip)[kept] for part, kept in zip(parts, good, strict=True)]),
+        world=torch.cat([world[kept] for world, kept in zip(worlds, good, strict=True)]),
         names=tuple(table.names),
         starts=draw_starts(table, STARTS, np.random.default_rng([seed, 2])),
     )

@@ -45,7 +45,7 @@ THREADS = 2  # of torch, where none are asked for: one number everywhere keeps r
 EVAL_SAMPLES = 8192
 LOG_EVERY = 20
 # Settings that decide the recorded data.
-RECORDING = ("samples", "rows", "transitions", "code_noise", "reach_at_end", "env")
+RECORDING = ("samples", "rows", "transitions", "code_noise", "reach_at_end", "wander", "env")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,8 @@ class PretrainConfig:
 
     samples: control steps to record. rows: worlds that record. transitions: changes of clip per second. code_noise:
     share of scalars whose executed code is one level off. reach_at_end: how far, in metres of roaming.likeness, a
-    motion may jump where its clip ends and nothing nearer follows. env: pushes, noise and episodes of the recording.
+    motion may jump where its clip ends and nothing nearer follows. wander: seconds between changes of where half of
+    the rows want to go, 0 for none. env: pushes, noise and episodes of the recording.
     iterations of batch samples; lr falls by a cosine to lr_end after warmup iterations. weight_decay: of matrices.
     label_smoothing. ema: factor of the averaged weights. state_noise: standard deviations. held_out: share of worlds.
     eval_every: iterations between evaluations, saves included.
@@ -71,6 +72,7 @@ class PretrainConfig:
     transitions: float = 0.3
     code_noise: float = 0.0
     reach_at_end: float = REACH
+    wander: float = 0.0
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.5)
     iterations: int = 3000
     batch: int = 512
@@ -296,6 +298,7 @@ def _recorded(
         transitions=config.transitions,
         code_noise=config.code_noise,
         reach_at_end=config.reach_at_end,
+        wander=config.wander,
         quiet=quiet,
     )
     data.save(path, identity | {"config": to_dict(config)})

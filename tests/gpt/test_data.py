@@ -63,6 +63,16 @@ def test_the_same_seed_records_the_same_at_any_thread_count(tokenizer, table):
     assert not torch.equal(one.states[:8], other.states[:8])
 
 
+def test_half_of_the_rows_may_wander(tokenizer, table):
+    settings = {"samples": 480, "rows": 8, "seed": 3, "quiet": True}
+    plain = record(tokenizer, table, threads=1, **settings)
+    one, two = (record(tokenizer, table, wander=0.5, threads=threads, **settings) for threads in (1, 2))
+    assert torch.equal(one.states, two.states) and torch.equal(one.tokens, two.tokens)
+    half = record(tokenizer, table, threads=1, **settings | {"samples": 240})
+    assert 0 < len(half) < len(one) <= 480
+    assert torch.equal(one.states[: len(half)], half.states) and torch.equal(half.states[:8], plain.states[:8])
+
+
 def test_a_data_set_returns_from_its_file(tokenizer, table, tmp_path):
     data = record(tokenizer, table, samples=200, rows=8, threads=1, quiet=True)
     data.save(tmp_path / "tokens.safetensors", {"seed": 0})
