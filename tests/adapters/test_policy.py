@@ -83,6 +83,20 @@ def test_score_says_what_draw_said(head, kind, top_p, temperature):
     assert torch.equal(again.tokens, drawn.tokens) and torch.equal(again.keep, drawn.keep)
 
 
+@heads
+def test_guidance_goes_further_the_same_way(head):
+    adapted, (state, c, _) = bend("cola", head, moved=True).double(), batch(64)
+    state, c = state.double(), c.double()
+    drawn = draw(adapted, state, c, generator=seeded(), top_p=0.8, guidance=2.5)
+    scored = score(adapted, state, c, drawn.tokens, drawn.keep, guidance=2.5, reference=True)
+    torch.testing.assert_close(scored.log_prob.detach(), drawn.log_prob.sum(-1), rtol=0, atol=1e-9)
+    plain, bent = (score(adapted, state, c, drawn.tokens, drawn.keep, guidance=g, reference=True) for g in (0.0, 1.0))
+    assert float(plain.kl.abs().max()) < 1e-9  # none of it is the base
+    assert (scored.kl > bent.kl).double().mean() > 0.9
+    base = draw(adapted, state, c, generator=seeded(), guidance=0.0)
+    assert torch.equal(base.tokens, sample(adapted.base, state, generator=seeded(), top_p=0.9))
+
+
 @pytest.mark.parametrize("kind", ["lora", "cola"])
 @heads
 def test_in_single_precision_score_and_draw_differ_by_rounding(head, kind):

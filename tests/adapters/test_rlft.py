@@ -175,7 +175,7 @@ def test_reward_moves_the_tokens_within_the_nucleus_and_by_the_task_alone(tmp_pa
         ({"top_p": 0.0}, r"top_p must lie in \(0, 1\], not 0\.0"),
         ({"top_p": 1.5}, "not 1.5"),
         ({"temperature": 0.0}, "a temperature is above 0"),
-        ({"kl": -1.0}, "kl and entropy are not below it"),
+        ({"kl": -1.0}, "kl, entropy and guidance are not below it"),
         ({"entropy": -0.1}, "entropy=-0.1"),
     ],
 )
