@@ -71,7 +71,7 @@ class FinetuneConfig:
     env: EnvConfig = EnvConfig(episode_seconds=16.0)
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            epochs=2, minibatch=2048, gamma=0.98, lr=3e-4, lr_max=1e-3, target_kl=0.015, critic_lr=1e-3
+            epochs=2, minibatch=2048, gamma=0.99, lr=3e-4, lr_max=1e-3, target_kl=0.015, critic_lr=1e-3
         )
     )
 

@@ -105,8 +105,7 @@ def demonstrate(
             done[t, step.done] = True
             # A row that ended begins anew where it was; one that lands has come to where its body is now.
             landing = np.flatnonzero((task.landing >= 0) & ~done[t])
-            now = world.sim.state()
-            arrived = place.seen(now.rows(everyone))
+            arrived = place.seen(world.sim.state())
             old = there.pos[:, 0, :2].copy()
             heading = rotation.heading(there.quat)
             old[landing], heading[landing] = arrived.pos[landing, 0, :2], rotation.heading(arrived.quat[landing])

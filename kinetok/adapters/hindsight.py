@@ -8,9 +8,9 @@ cross-entropy to choose the tokens that were chosen, given that observation. No 
 the motion is the teacher. Steps before a fall are left out, so that what remains upright is learned.
 
 Two sources of motion: recorded clips, which the frozen tokenizer tracks, and the policy itself, which plays the task
-round after round. Clips that turn and halt on purpose say far more about where tokens lead than what a prior draws at
-random, whose turns cancel within a second. They say most when they are played as the task asks, by motion matching
-(`matching`): then nothing has to be relabelled, and what is learned depends on what was asked and not on the state.
+round after round. Clips are played as the task asks, by motion matching (`matching`), where nothing has to be
+relabelled, or as they are. Neither has brought a skill yet (docs/log.md): most of what is learned follows from the
+state, and little from what was asked.
 
 Goal-conditioned supervised learning (Ghosh et al. 2021, "Learning to reach goals via iterated supervised
 learning"; of demonstrations, Ding et al. 2019, "Goal-conditioned imitation learning"), which GPC does not use:

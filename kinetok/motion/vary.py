@@ -10,7 +10,7 @@ keep a motion near to what a body can do, and physics does the rest when it is t
 - halt     it comes to rest where both feet are on the floor and hardly move, stays a while, and goes on
 
 Nothing here simulates: the result is a reference, to be tracked like any other. Where the feet stand, a bent path drags
-them along an arc, a few centimetres a step; a simulated body cannot follow that, which is its error and its repair.
+them along an arc; a simulated body does not follow that, and its tracking error is larger for it.
 """
 
 from dataclasses import replace
