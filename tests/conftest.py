@@ -64,6 +64,11 @@ def walk(data_dir):
 
 
 @pytest.fixture(scope="session")
+def jog(data_dir):
+    return read_deepmimic(data_dir / "train" / "deepmimic" / "humanoid3d_jog.txt")
+
+
+@pytest.fixture(scope="session")
 def getup(data_dir):
     """A clip that is no loop, cut to one second."""
     return read_deepmimic(data_dir / "train" / "deepmimic" / "humanoid3d_getup_facedown.txt").slice(0.0, 1.0)

@@ -1,5 +1,6 @@
 """Commands about motion and bodies: `kinetok clips ...`, `kinetok characters ...`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -112,21 +113,27 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
 @click.option("--turn", default=60.0, show_default=True, help="Degrees per second it turns at most, to either side.")
 @click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
 @click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
+@click.option("--into", default=None, type=PATHS, help="A gait to go over into and back, in step.")
+@click.option("--count", default=1, show_default=True, help="Motions to make, of seeds that follow one another.")
 @option_seed
-def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, seed) -> None:
-    """Make one long motion of a gait cycle: turning, hurrying, lingering, halting.
+def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into, count, seed) -> None:
+    """Make long motions of a gait cycle: turning, hurrying, lingering, halting.
 
     \b
-    A prior of straight walks has nothing to choose from; one of varied walks can be steered.
-    kinetok clips vary walk.txt --halt 6 --out walk-varied.safetensors
+    A prior of straight walks has nothing to choose from; one of varied walks can be steered, and the more of them
+    there are, the nearer is always one that turns as asked.
+    kinetok clips vary walk.txt --turn 80 --count 6 --out walk-varied.safetensors
+    kinetok clips vary walk.txt --into jog.txt --out walk-jog.safetensors
     """
-    from kinetok.motion.library import ClipLibrary
     from kinetok.motion.vary import vary
 
     check_suffix(out, ".safetensors")
-    varied = vary(one_clip(source, name), seconds=seconds, turn=turn, tempo=tempo, halt=halt, seed=seed)
-    ClipLibrary.write(out, [varied])
-    click.echo(f"wrote {out}: {varied.name}, {varied.seconds:.1f} s")
+    clip, other = one_clip(source, name), None if into is None else one_clip(into, None)
+    told = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt, "into": other}
+    varied = [vary(clip, seed=seed + number, **told) for number in range(count)]
+    if count > 1:
+        varied = [replace(motion, name=f"{motion.name}-{number}") for number, motion in enumerate(varied, 1)]
+    write_motion(out, *varied)
 
 
 @clips.command("export")

@@ -1,13 +1,16 @@
-"""Variations of a gait: turn where it went straight, hurry, linger, halt and go on.
+"""Variations of a gait: turn where it went straight, hurry, linger, halt and go on, go over into another gait.
 
     clip = vary(walk, seconds=60, turn=60, tempo=1.2, halt=6, seed=0)      # one long motion, no longer a loop
+    clip = vary(walk, into=jog, seconds=60, turn=60)                       # from walking to jogging and back
 
-A recorded walk cycle goes one way at one speed; a prior that saw no other has nothing to choose from. Three changes
+A recorded walk cycle goes one way at one speed; a prior that saw no other has nothing to choose from. Four changes
 keep a motion near to what a body can do, and physics does the rest when it is tracked:
 
 - turn     the path is bent by a yaw rate that wanders; the body leans into it by atan(v * rate / g) about its feet
 - tempo    the motion plays faster and slower by a factor that wanders
 - halt     it comes to rest where both feet are on the floor and hardly move, stays a while, and goes on
+- into     its cycle is blended with another's, in step (Rose, Cohen, Bodenheimer 1998, "Verbs and adverbs"), by a share
+           that wanders: between a walk and a jog lie all the speeds that neither has
 
 Nothing here simulates: the result is a reference, to be tracked like any other. Where the feet stand, a bent path drags
 them along an arc; a simulated body does not follow that, and its tracking error is larger for it.
@@ -19,7 +22,7 @@ import numpy as np
 
 from kinetok import rotation
 from kinetok.motion.character import Character
-from kinetok.motion.clip import Clip
+from kinetok.motion.clip import Clip, interpolate
 from kinetok.motion.kinematics import kinematics
 
 VARIED = "-varied"
@@ -28,16 +31,25 @@ WANDER = 1.5  # seconds from one random value of turn or tempo to the next
 RAMP = 0.5  # seconds to stop or to start
 STAY = (0.5, 2.5)  # seconds a halt lasts
 QUIET = 0.7  # m/s: the fastest foot of a moment at which a body can halt
+DWELL = 0.8  # above 0.5 a blend stays in either gait for a while
 GRAVITY = 9.81
 
 
 def vary(
-    clip: Clip, *, seconds: float = 60.0, turn: float = 60.0, tempo: float = 1.2, halt: float = 0.0, seed: int = 0
+    clip: Clip,
+    *,
+    seconds: float = 60.0,
+    turn: float = 60.0,
+    tempo: float = 1.2,
+    halt: float = 0.0,
+    into: Clip | None = None,
+    seed: int = 0,
 ) -> Clip:
     """A motion of `seconds` made of a clip that begins and ends alike, or of as much of another one as there is.
 
     turn: degrees per second the path turns at most, to either side. tempo: it plays so many times as fast or slow at
-    most. halt: seconds of moving between two halts on average; 0 for none. The same seed gives the same motion.
+    most. halt: seconds of moving between two halts on average; 0 for none. into: a gait, of one left and one right step
+    like `clip` itself, that it goes over into and back. The same seed gives the same motion.
     Raises ValueError for a motion that has no moment to halt at, naming its fastest foot.
     """
     if not (seconds > 0 and turn >= 0 and tempo >= 1 and halt >= 0):
@@ -45,8 +57,19 @@ def vary(
             f"clip {clip.name!r}: seconds must be above 0, turn and halt not below 0, tempo at least 1; "
             f"not {seconds}, {turn}, {halt}, {tempo}"
         )
+    if into is not None and (halt or not (clip.loop and into.loop) or clip.character != into.character):
+        raise ValueError(
+            f"{clip.name!r} into {into.name!r}: both must be loops of one character, and halt 0; they are of "
+            f"{clip.character!r} and {into.character!r}, loop {clip.loop} and {into.loop}, halt {halt:g}"
+        )
     rng, steps = np.random.default_rng(seed), round(seconds * FPS)
     bent, speed = _wander(rng, steps) * np.radians(turn), tempo ** _wander(rng, steps)
+    source = f"varied by turn {turn:g} deg/s, tempo {tempo:g}, halt {halt:g} s, seed {seed}"
+    if into is not None:
+        share = (0.5 + DWELL * _wander(rng, steps)).clip(0, 1)
+        qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
+        source = f"{clip.source} into {into.source}, {source}"
+        return replace(clip, name=name, fps=FPS, qpos=_bend(qpos, bent * speed), loop=False, source=source)
     phase = _play(speed, _quiet(clip) if halt else np.empty(0), halt, rng, clip)
     if not clip.loop:
         phase = phase[: np.searchsorted(phase, clip.seconds)]
@@ -56,7 +79,7 @@ def vary(
     rate = np.diff(phase, append=2 * phase[-1] - phase[-2]) * FPS
     return replace(
         clip, name=clip.name + VARIED, fps=FPS, qpos=_bend(qpos, bent[: len(qpos)] * rate), loop=False,
-        source=f"{clip.source}, varied by turn {turn:g} deg/s, tempo {tempo:g}, halt {halt:g} s, seed {seed}",
+        source=f"{clip.source}, {source}",
     )  # fmt: skip
 
 
@@ -109,6 +132,31 @@ def _rest(distance: float, rate: float, rng: np.random.Generator) -> list[float]
     still, up = np.zeros(round(rng.uniform(*STAY) * FPS)), round(RAMP * FPS)
     starting = rate * (1 - np.cos(np.pi * (np.arange(up) + 0.5) / up)) / 2
     return [*slowing, *still, *starting]
+
+
+def _blend(clip: Clip, into: Clip, share: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Poses (T, nq) with a share (T,) of `into`, in step: both cycles are counted from where the left foot leads most.
+
+    Cycles per second are blended as the poses are, and times speed (T,); so is the way of each step.
+    """
+    rate = speed / (clip.seconds + share * (into.seconds - clip.seconds))
+    cycles = np.concatenate([[0.0], np.cumsum(rate[:-1])]) / FPS
+    a, b = (gait.at((cycles + _leads(gait)) * gait.seconds) for gait in (clip, into))
+    qpos = interpolate(Character.load(clip.character), a, b, share)
+    way = np.diff(a[:, :2], axis=0) * (1 - share[:-1, None]) + np.diff(b[:, :2], axis=0) * share[:-1, None]
+    qpos[:, :2] = a[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(way, axis=0)])
+    return qpos
+
+
+def _leads(clip: Clip) -> float:
+    """The share of the cycle after which the character's second foot is furthest ahead of its first one."""
+    body = Character.load(clip.character)
+    times = np.arange(0, clip.seconds, 1 / FPS)
+    qpos = clip.at(times)
+    first, second = (kinematics(body, qpos, FPS).xpos[:, foot] for foot in body.bodies("feet")[:2])
+    heading = rotation.heading(qpos[:, 3:7])
+    ahead = ((second - first)[:, :2] * np.stack([np.cos(heading), np.sin(heading)], axis=1)).sum(1)
+    return float(times[ahead.argmax()] / clip.seconds)
 
 
 def _bend(qpos: np.ndarray, rate: np.ndarray) -> np.ndarray:

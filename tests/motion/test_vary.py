@@ -74,3 +74,21 @@ def test_what_is_refused(humanoid):
         vary(glide(humanoid), halt=2)
     with pytest.raises(ValueError, match=r"tempo at least 1; not 60.0, 60.0, 0.0, 0.5"):
         vary(glide(humanoid), tempo=0.5)
+
+
+def test_a_walk_goes_over_into_a_jog_in_step(walk, jog, humanoid):
+    varied = vary(walk, into=jog, seconds=60, turn=0, tempo=1, seed=3)
+    assert varied.name == f"{walk.name}-{jog.name}-varied" and not varied.loop
+    speed = np.convolve(np.diff(varied.qpos[:, 0]) * FPS, np.ones(60) / 60, "valid")
+    ends = [np.hypot(*(clip.qpos[-1, :2] - clip.qpos[0, :2])) / clip.seconds for clip in (walk, jog)]
+    assert speed.min() == pytest.approx(ends[0], rel=0.15) and speed.max() == pytest.approx(ends[1], rel=0.15)
+    motion = kinematics(humanoid, varied.qpos, FPS)
+    right, left = (motion.xpos[:, foot, 0] for foot in humanoid.bodies("feet"))
+    strides = [np.ptp((left - right)[t : t + 80]) for t in range(0, len(left) - 80, 20)]
+    assert min(strides) > 1.0  # a walk's is 1.2 m; out of step the two would take from one another
+    assert lowest_point(humanoid, varied.qpos).min() > -0.03
+
+
+def test_only_loops_of_one_body_go_over_into_one_another(walk):
+    with pytest.raises(ValueError, match=r"both must be loops of one character, and halt 0; .* loop True and False"):
+        vary(walk, into=vary(walk, seconds=2))

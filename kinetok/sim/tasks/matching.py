@@ -17,7 +17,8 @@ from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.roaming import Roaming, likeness
 from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
 
-SEARCHES = 2.5  # a second, each row at moments of its own
+SEARCHES = 5.0  # a second, each row at moments of its own
+REACH = 0.15  # metres of `likeness`: frames of one gait, of which a varied one has many, are nearer than that
 LIKENESS = 4.0  # weight of the squared likeness, against the squared metres by which a wish is missed
 MARGIN = 0.02  # square metres by which another frame must be better
 
@@ -32,7 +33,7 @@ class Matching(Roaming):
         *,
         rows: int,
         rng: np.random.Generator,
-        reach: float = 0.35,
+        reach: float = REACH,
     ):
         super().__init__(config, table, rows=rows, transitions=SEARCHES, rng=rng, reach=reach, reach_at_end=2 * reach)
         self.wish = np.zeros((rows, 2), np.float32)
