@@ -154,6 +154,16 @@ def test_clips_import_gathers_files_into_a_library(clip, tmp_path):
     ]
 
 
+def test_clips_vary_makes_as_many_motions_as_asked_for(data_dir, tmp_path):
+    walk, jog = (data_dir / "train" / "deepmimic" / f"humanoid3d_{gait}.txt" for gait in ("walk", "jog"))
+    out = tmp_path / "varied.safetensors"
+    assert kinetok("clips", "vary", walk, "--seconds", 3, "--count", 2, "--out", out).exit_code == 0
+    one, two = read_clips(out)
+    assert (one.name, two.name) == ("walk-varied-1", "walk-varied-2") and not np.array_equal(one.qpos, two.qpos)
+    assert kinetok("clips", "vary", walk, "--into", jog, "--seconds", 3, "--out", out).exit_code == 0
+    assert [clip.name for clip in read_clips(out)] == ["walk-jog-varied"]
+
+
 def test_fit_writes_every_stage_and_goes_on_where_it_was(run, clip):
     assert load_artifact(run).kind == "tokenizer"
     assert all(load_artifact(run / stage) for stage in ("teachers/wave", "distill", "ppo"))

@@ -95,7 +95,8 @@ def distill(
     if len(teachers) != len(table.names):
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
-    tracking = TrackingConfig(future=future, fail_mean=config.fail_mean)
+    seen_by_any = {frame for one in (student, *teachers) for frame in one.config.future}
+    tracking = TrackingConfig(future=tuple(sorted(seen_by_any)), fail_mean=config.fail_mean)
     task = Tracking(tracking, table, rows=config.rows)
     if config.transitions:
         rng, rate = np.random.default_rng([seed, 1]), config.transitions
@@ -103,7 +104,8 @@ def distill(
     task.weights = ClipWeights(len(table.names), bounds=(config.focus**-0.5, config.focus**0.5))
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     flags = mirrored or [False] * len(teachers)
-    views = [_View(teacher, task, flag) for teacher, flag in zip(teachers, flags, strict=True)]
+    views = [_View(teacher.eval(), task, flag) for teacher, flag in zip(teachers, flags, strict=True)]
+    learner = _View(student, task, False)
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
     identity = identify(config, student.config, table.names, seed) | ({"parents": parents} if parents else {})
@@ -127,13 +129,13 @@ def distill(
         obs = torch.from_numpy(env.reset(spread=True))
         while step < total:
             with torch.no_grad(), torch_threads(1):
-                action = student.act(obs)[0]
+                action = learner.act(obs)
                 target = _label(views, obs, task)
                 rows = torch.arange(cursor, cursor + config.rows) % config.memory
                 memory[rows], labels[rows] = obs, target
                 cursor, filled = cursor + config.rows, min(filled + config.rows, config.memory)
                 if float(student.norm.count) < 1_000_000:
-                    student.observe(obs)
+                    student.observe(learner.seen(obs))
                 action += config.noise * torch.randn(action.shape, generator=generator)
                 seen = env.step(action.numpy()).obs
                 if isinstance(task, Roaming):
@@ -144,7 +146,7 @@ def distill(
             loss = torch.zeros(())
             for _ in range(config.updates):
                 ids = torch.randint(filled, (config.minibatch,), generator=generator)
-                loss = _regress(student, optimizer, memory[ids], labels[ids])
+                loss = _regress(student, optimizer, learner.seen(memory[ids]), labels[ids])
             step += 1
             samples = step * config.rows
             metrics = {"label_rmse": float(loss) ** 0.5} if step % 20 == 0 else {}
@@ -172,27 +174,26 @@ def distill(
 
 
 class _View:
-    """A teacher with its own future window, seen through the student's observations, or through a mirror.
+    """A tokenizer that sees its own future window among the task's, and the world as it is or through a mirror."""
 
-    The teacher's window frames must be among the student's; its observation is a selection of columns.
-    """
-
-    def __init__(self, teacher: MotionTokenizer, task: Tracking, mirrored: bool):
-        missing = set(teacher.config.future) - set(task.config.future)
-        if missing:
-            raise ValueError(f"teacher looks {sorted(missing)} steps ahead, the student only {task.config.future}")
+    def __init__(self, tokenizer: MotionTokenizer, task: Tracking, mirrored: bool):
         window, count = task.layout["window"], len(task.config.future)
         columns = torch.arange(window.start, window.stop).view(count, -1)
-        picked = columns[[task.config.future.index(f) for f in teacher.config.future]].flatten()
+        picked = columns[[task.config.future.index(f) for f in tokenizer.config.future]].flatten()
         before, after = torch.arange(window.start), torch.arange(window.stop, task.obs_size)
-        self.teacher, self.columns = teacher.eval(), torch.cat([before, picked, after])
-        self.mirror = Mirror.of(teacher.config.character, teacher.config.future) if mirrored else None
+        self.tokenizer, self._columns = tokenizer, torch.cat([before, picked, after])
+        self._whole = torch.equal(self._columns, torch.arange(task.obs_size))
+        self.mirror = Mirror.of(tokenizer.config.character, tokenizer.config.future) if mirrored else None
+
+    def seen(self, obs: Tensor) -> Tensor:
+        """The tokenizer's own observation (N, O) of the task's."""
+        return obs if self._whole else obs[:, self._columns]
 
     def act(self, obs: Tensor) -> Tensor:
-        seen = obs[:, self.columns]
+        own = self.seen(obs)
         if self.mirror is None:
-            return self.teacher.act(seen)[0]
-        return self.mirror.action(self.teacher.act(self.mirror.observation(seen))[0])
+            return self.tokenizer.act(own)[0]
+        return self.mirror.action(self.tokenizer.act(self.mirror.observation(own))[0])
 
 
 def _label(views: list[_View], obs: Tensor, task: Tracking) -> Tensor:

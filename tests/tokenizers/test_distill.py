@@ -58,6 +58,13 @@ def test_the_student_learns_what_the_teachers_do(student, teachers, standing, co
     assert len(errors) == 5 and errors[-1] < 0.6 * errors[0]
 
 
+def test_each_looks_as_far_ahead_as_it_does(small, student, teachers, standing, config, tmp_path):
+    longer = replace(config, samples=100 * 32, eval_every=100 * 32, updates=3, minibatch=128, memory=3200, lr=3e-3)
+    distill(student, [teachers[0], far(small, standing)], standing, longer, tmp_path, quiet=True)
+    errors = [line["label_rmse"] for line in untimed(tmp_path)]
+    assert errors[-1] < 0.8 * errors[0] and MotionTokenizer.from_pretrained(tmp_path).config.future == (1, 2, 5)
+
+
 def test_a_resumed_run_is_the_unbroken_one(whole, config, small, student, teachers, standing, tmp_path, cut_off):
     out, score = whole
     cut_off(module, 3, lambda: distill(student, teachers, standing, config, tmp_path, quiet=True))
@@ -113,7 +120,7 @@ def test_a_teacher_sees_its_own_observation(small, standing, future):
         obs[window] = [torch.from_numpy(env.step(action).obs) for _ in range(4)]
     view = _View(teacher, Tracking(TrackingConfig(future=small.tokenizer.future), standing, rows=6), False)
     for student_sees, teacher_sees in zip(obs[small.tokenizer.future], obs[future], strict=True):
-        assert torch.equal(student_sees[:, view.columns], teacher_sees)
+        assert torch.equal(view.seen(student_sees), teacher_sees)
         with torch.no_grad():
             assert torch.equal(view.act(student_sees), teacher.act(teacher_sees)[0])
 
@@ -181,11 +188,6 @@ def far(small, standing) -> MotionTokenizer:
             lambda run, teachers, **_: run(teachers[:1]),
             ValueError,
             "2 clips need a teacher each (the same one may repeat), not 1",
-        ),
-        (
-            lambda run, teachers, small, standing, **_: run([teachers[0], far(small, standing)]),
-            ValueError,
-            "teacher looks [30] steps ahead, the student only (1, 2, 5)",
         ),
         (
             lambda run, teachers, whole, config, **_: run(teachers, replace(config, noise=0.5), whole[0]),

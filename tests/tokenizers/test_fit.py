@@ -257,11 +257,6 @@ def other_body(tmp_path) -> Clip:
             "cannot group 6 scalars by 4: scalars per token must be a divisor of 6",
         ),
         (
-            lambda clips, small, tmp_path: (clips, override(small, ["teacher_tokenizer.future=1,9"])),
-            ConfigError,
-            "teacher_tokenizer.future looks [9] steps ahead, which tokenizer.future (1, 2, 5) does not hold",
-        ),
-        (
             lambda clips, small, tmp_path: (clips, override(small, ["ppo.env.scene.substeps=2"])),
             ConfigError,
             "a stage's env.scene differs from tokenizer.scene (substeps: 4 -> 2); set the latter",
