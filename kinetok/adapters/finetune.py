@@ -308,6 +308,7 @@ def _look_back(
 ) -> None:
     table = ReferenceTable(ClipLibrary.of(clips), control_hz=skill.prior.fps) if clips else None
     task = task_of(config.task, skill.prior, config.hindsight.rows)
+    asking = task_of(config.task.restless(config.hindsight.restless), skill.prior, config.hindsight.rows)
     scene = skill.prior.tokenizer.config.scene
     world = replace(in_scene(config.env, scene), episode_seconds=config.hindsight.seconds + 1)
     env = Env(world, task, rows=config.hindsight.rows, threads=threads, seed=seed)
@@ -325,6 +326,7 @@ def _look_back(
         keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
         identity=identity | own,
         table=table,
+        asking=asking,
         seed=seed,
         threads=threads,
         quiet=quiet,

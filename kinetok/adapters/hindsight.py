@@ -48,10 +48,11 @@ class HindsightConfig:
     """rounds: of learning, each of `iterations` of `batch` samples at lr, falling to a tenth over all rounds; rows,
     seconds: of the task played before each round, but for the first where there are clips; memory: rounds whose samples
     are kept; samples: control steps of tracked clips, which are kept all the time; matching: the clips are played as
-    the task asks, by motion matching (guide.py), and not as they are; code_noise, transitions, env: of the tracking, as
-    in recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors: directions of
-    what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are alike; boost: at
-    most so much more often."""
+    the task asks, by motion matching (guide.py), and not as they are; restless: range of seconds after which what is
+    asked changes there, so soon that the motion so far says little about it; code_noise, transitions, env: of the
+    tracking, as in recording for a prior; doomed: seconds before a fall that are left out; label_smoothing; sectors:
+    directions of what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are
+    alike; boost: at most so much more often."""
 
     rounds: int = 4
     rows: int = 512
@@ -63,6 +64,7 @@ class HindsightConfig:
     samples: int = 200_000
     code_noise: float = 0.05
     matching: bool = True
+    restless: tuple[float, float] = (0.4, 4.0)
     transitions: float = 0.1
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.3, episode_seconds=20.0)
     doomed: float = 1.5
@@ -81,14 +83,15 @@ def hindsight(
     keep: Callable[[S], None],
     identity: dict,
     table: ReferenceTable | None = None,
+    asking: Goal | None = None,
     seed: int = 0,
     threads: int = 0,
     quiet: bool = False,
 ) -> None:
     """Adapt in place. After each round `evaluate` measures, and `keep` is called with the best score so far.
 
-    table: the clips to learn from, if any. `out` receives metrics.jsonl and a state from which a later call with the
-    same identity goes on after the last round.
+    table: the clips to learn from, if any, and asking: what they are matched to, by default the task of env. `out`
+    receives metrics.jsonl and a state from which a later call with the same identity goes on after the last round.
     """
     adapted, best, done = policy.adapted, -1e9, 0
     optimizer = torch.optim.Adam(adapted.trainable(), lr=config.lr, fused=True)
@@ -102,13 +105,13 @@ def hindsight(
     total = config.rounds * config.iterations
     lessons = []
     if table is not None and done < config.rounds:
-        lessons = [demonstrated(policy, env, table, config, seed, threads, quiet)]
+        lessons = [demonstrated(policy, env, table, asking, config, seed, threads, quiet)]
     with Logger(out, total=total, title="hindsight", start=done * config.iterations, quiet=quiet) as log:
         for number in range(done, config.rounds):
             env.rng = np.random.default_rng([seed, number])
             if number or not lessons:
                 if table is not None and config.matching:
-                    told = demonstrated(policy, env, table, config, seed + number, threads, quiet, generator)
+                    told = demonstrated(policy, env, table, asking, config, seed + number, threads, quiet, generator)
                 else:
                     told = relabel(play_on(policy, env, config, generator), env, config, seed + number)
                 memory = [*memory, told]
@@ -165,6 +168,7 @@ def demonstrated(
     policy: TokenPolicy,
     env: Env,
     table: ReferenceTable,
+    asking: Goal | None,
     config: HindsightConfig,
     seed: int,
     threads: int,
@@ -181,7 +185,8 @@ def demonstrated(
         return relabel(roam(policy.tokenizer, table, transitions=config.transitions, **told), env, config, seed)
     if generator is not None:
         told |= {"samples": config.samples // 3, "driver": policy.controller(generator)}
-    states, c, tokens = demonstrate(policy.tokenizer, table, cast(Goal, env.task), doomed=config.doomed, **told)
+    goal = asking or cast(Goal, env.task)
+    states, c, tokens = demonstrate(policy.tokenizer, table, goal, doomed=config.doomed, **told)
     return states, c, tokens, torch.ones(len(states))
 
 

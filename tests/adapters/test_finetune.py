@@ -112,7 +112,7 @@ def test_the_skill_is_found_with_its_prior_and_played(whole, models):
     again = play(given.controller(3), given.task, given.prior, episodes=2, seconds=1.0, seed=3, threads=2)
     assert again.score == played.score
     greedy = Skill.from_pretrained(whole, skill.prior).controller(None)
-    obs = torch.randn(2, skill.prior.gpt.config.state_dim + 2)
+    obs = torch.randn(2, skill.prior.gpt.config.state_dim + 4)
     assert torch.equal(greedy(obs), greedy(obs))
 
 
@@ -192,7 +192,7 @@ def test_every_adapter_runs_and_every_task(models, tmp_path, kind, task):
     config = replace(reshaped(TINY, task=task, adapter=kind), samples=64, env=EnvConfig(episode_seconds=0.3))
     skill = run(models, tmp_path, config)
     assert skill.adapted.config.kind == kind and skill.task.kind == task
-    width = {"target": 2, "steering": 4, "path": 20}[task]
+    width = {"target": 4, "steering": 4, "path": 20}[task]
     assert skill.adapted.cond_dim == width == Skill.from_pretrained(tmp_path).adapted.cond_dim
     played = play(skill.controller(0), skill.task, skill.prior, episodes=1, seconds=0.2, threads=1)
     assert np.isfinite(played.score.merit)
@@ -230,10 +230,10 @@ def test_after_examples_the_task_finds_the_style_as_it_was(whole, models):
     prior = Prior.from_pretrained(models / "prior")
     style = Adapted.from_pretrained(whole / "sft", prior.gpt)
     state, tokens = torch.randn(4, prior.gpt.config.state_dim), torch.randint(125, (4, 2))
-    asked = style(state, torch.zeros(4, 2), tokens)
-    for statistics in (torch.randn(50, 2), 5.0 + torch.randn(500, 2)):
+    asked = style(state, torch.zeros(4, 4), tokens)
+    for statistics in (torch.randn(50, 4), 5.0 + torch.randn(500, 4)):
         style.observe(statistics)
-        assert torch.equal(style(state, torch.randn(4, 2), tokens), asked)
+        assert torch.equal(style(state, torch.randn(4, 4), tokens), asked)
     assert not torch.allclose(prior.gpt(state, tokens), asked)
 
 
@@ -276,7 +276,7 @@ WRONG = {  # config; options from the clips and a finished run; message
     "start of another width": (
         replace(TINY, task=PathConfig()),
         lambda clips, skill: {"start": skill},
-        "another shape: cond_dim: 2 -> 20. Ask for the same adapter, and for a task whose observation is as wide",
+        "another shape: cond_dim: 4 -> 20. Ask for the same adapter, and for a task whose observation is as wide",
     ),
     "start and examples": (BOTH, lambda clips, skill: {"clips": clips, "start": skill}, "--from needs --method rl"),
     "no start": (TINY, lambda clips, skill: {"start": "nowhere"}, "there is no directory nowhere"),

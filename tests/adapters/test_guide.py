@@ -36,7 +36,7 @@ def test_a_demonstration_repeats_and_holds_what_was_asked(prior, table):
 
     states, c, tokens = run(1)
     assert 0 < len(states) == len(c) == len(tokens) < 480
-    assert states.shape[1] == prior.gpt.config.state_dim and c.shape[1] == 2 and tokens.shape[1] == 2
+    assert states.shape[1] == prior.gpt.config.state_dim and c.shape[1] == 4 and tokens.shape[1] == 2
     assert 0.1 < float(c.norm(dim=1).max()) < 12
     assert all(torch.equal(a, b) for a, b in zip((states, c, tokens), run(1, threads=2), strict=True))
     assert not torch.equal(states[:8], run(2)[0][:8])

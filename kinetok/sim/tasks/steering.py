@@ -10,7 +10,7 @@ direction: walking sideways and backwards is not among the recorded motions that
 zero is never asked for: eq. 12 rewards no velocity against the direction, however small.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -46,6 +46,10 @@ class SteeringConfig:
         check_ranges(seconds=self.seconds, speed=self.speed)
         if not (0 <= self.free_facing <= 1 and 0 <= self.turn <= np.pi):
             raise ConfigError(f"free_facing is a share and turn at most pi, not {self.free_facing} and {self.turn}")
+
+    def restless(self, seconds: tuple[float, float]) -> "SteeringConfig":
+        """The same task, in which something else is asked after so many seconds."""
+        return replace(self, seconds=seconds)
 
 
 class Steering:

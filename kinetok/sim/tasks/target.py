@@ -4,11 +4,12 @@
     env = Env(EnvConfig(), task, rows=64)
 
 The observation of a row is state | task (see `layout`): proprioception, and the target in the heading frame, 2
-numbers in metres. The paper is silent on how far targets lie: up to 5 m here, which a walk of 1 m/s (the recorded
-ones' pace) reaches before the next one comes, from behind too.
+numbers in metres, as in the paper, and its direction, a unit vector (ours: what turns a walker is the direction, and
+a small network learns to read it off the metres late). The paper is silent on how far targets lie: up to 5 m here,
+which a walk of 1 m/s (the recorded ones' pace) reaches before the next one comes, from behind too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -42,6 +43,10 @@ class TargetConfig:
         if self.distance[0] <= self.near:
             raise ConfigError(f"distance {self.distance} begins within near {self.near} m: reached without a step")
 
+    def restless(self, seconds: tuple[float, float]) -> "TargetConfig":
+        """The same task, in which something else is asked after so many seconds."""
+        return replace(self, seconds=seconds)
+
 
 class Target:
     """The task of `rows` worlds. target (N, 2): metres, world frame; reached (N,): whether the root has come near."""
@@ -58,7 +63,7 @@ class Target:
         control_hz: int = 30,
     ):
         self.config, self.character, self.control_hz = config, character, control_hz
-        self.world = Upright(character, qpos, qvel, rows=rows, starts=starts, fall_height=config.fall_height, numbers=2)
+        self.world = Upright(character, qpos, qvel, rows=rows, starts=starts, fall_height=config.fall_height, numbers=4)
         self.layout, self.obs_size = self.world.layout, self.world.obs_size
         self.target = np.zeros((rows, 2), dtype=np.float32)
         self.left = np.zeros(rows, dtype=int)  # control steps until the next target
@@ -87,7 +92,7 @@ class Target:
         """state | task (n, O) float32 of all rows or of rows ids."""
         obs, task = self.world.blank(body)
         target = self.target if ids is None else self.target[ids]
-        task[:] = in_heading(target - body.pos[:, 0, :2], body.quat)
+        task[:] = _seen(in_heading(target - body.pos[:, 0, :2], body.quat))
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -128,11 +133,11 @@ class Target:
         )
         rests = (speed[..., 0] < RESTING) & (np.linalg.norm(there - root, axis=-1) < self.config.near)
         told = (longest >= hz // 2) & (rests | (speed[..., 0] > WALKING))
-        return from_heading((there - root + on).astype(np.float32), heading), told
+        return _seen(from_heading((there - root + on).astype(np.float32), heading)), told
 
     def wish(self, c: np.ndarray) -> np.ndarray:
-        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 2)."""
-        return c * (STRIDE / length(c).clip(STRIDE))[:, None]
+        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 4)."""
+        return c[:, :2] * (STRIDE / length(c[:, :2]).clip(STRIDE))[:, None]
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""
@@ -161,3 +166,8 @@ class Target:
         self.target[ids] = self.world.root[ids, :2] + offset
         self.left[ids] = (rng.uniform(*self.config.seconds, len(ids)) * hz).round()
         self.reached[ids] = False
+
+
+def _seen(offset: np.ndarray) -> np.ndarray:
+    """Task observations (..., 4) of a target at offset (..., 2): metres, and the direction."""
+    return np.concatenate([offset, offset / np.linalg.norm(offset, axis=-1, keepdims=True).clip(1e-6)], axis=-1)

@@ -27,8 +27,8 @@ def test_the_target_as_the_character_sees_it(humanoid):
     task = make(humanoid, 2)
     task.target[:] = [[1, 3], [1, 3]]
     obs = task.observe(body_at([[1, 1], [0, 3]], angle=[0.0, np.pi / 2]))
-    # 2 m to the left of a heading along x; 1 m along x is to the right of a heading along y
-    np.testing.assert_allclose(obs[:, task.layout["task"]], [[0, 2], [0, -1]], atol=1e-6)
+    # 2 m to the left of a heading along x; 1 m along x is to the right of a heading along y; then unit vectors
+    np.testing.assert_allclose(obs[:, task.layout["task"]], [[0, 2, 0, 1], [0, -1, 0, -1]], atol=1e-6)
     assert obs.shape == (2, task.obs_size)
 
 
