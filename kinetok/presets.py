@@ -54,6 +54,21 @@ def many_clips() -> FitConfig:
     )  # fmt: skip
 
 
+def generalist() -> FitConfig:
+    """One continuous expert of many clips, to teach others: what `teachers` know, gone on with by PPO on all clips."""
+    return FitConfig(
+        stages=("distill", "ppo"),
+        tokenizer=TokenizerConfig(
+            quantizer=ContinuousConfig(dim=64), future=(1, 2, 7), encoder=(384,), decoder=(192,),
+            encoder_inputs=("state", "window", "error"), decoder_inputs=(), residual=True,
+        ),
+        distill=DistillStage(samples=1_000_000, rows=512, transitions=0.15, reach_at_end=0.6, eval_every=250_000,
+                             eval_episodes=4, save_every=1_000_000, env=EnvConfig(reset_noise=0.02, push=0.3)),
+        ppo=PPOStage(samples=8_000_000, eval_every=300_000, eval_episodes=4, critic_warmup=10, arrivals=0.25,
+                     env=EnvConfig(reset_noise=0.02, push=0.3)),
+    )  # fmt: skip
+
+
 def from_scratch() -> FitConfig:
     """The paper's form: end-to-end PPO through the bottleneck from random weights, nothing else."""
     return FitConfig(
@@ -87,7 +102,13 @@ def tiny() -> FitConfig:
     )
 
 
-FIT = {"one-clip": one_clip, "many-clips": many_clips, "from-scratch": from_scratch, "tiny": tiny}
+FIT = {
+    "one-clip": one_clip,
+    "many-clips": many_clips,
+    "generalist": generalist,
+    "from-scratch": from_scratch,
+    "tiny": tiny,
+}
 
 
 def laptop() -> PretrainConfig:

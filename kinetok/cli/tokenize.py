@@ -19,7 +19,8 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
     """Train a tokenizer: encoder, FSQ bottleneck and decoder, through the simulated tracking loop.
 
     \b
-    Presets: one-clip (minutes), many-clips (hours), from-scratch (end-to-end PPO alone), tiny (tests).
+    Presets: one-clip (minutes), many-clips (hours), generalist (one teacher
+    for many), from-scratch (end-to-end PPO alone), tiny (tests).
     Example: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
     """
     from kinetok import presets

@@ -6,7 +6,8 @@
 A recorded walk cycle goes one way at one speed; a prior that saw no other has nothing to choose from. Four changes
 keep a motion near to what a body can do, and physics does the rest when it is tracked:
 
-- turn     the path is bent by a yaw rate that wanders; the body leans into it by atan(v * rate / g) about its feet
+- turn     the path is bent by a yaw rate that wanders, the less the faster it goes (SIDEWAYS); the body leans into it
+           by atan(v * rate / g) about its feet
 - tempo    the motion plays faster and slower by a factor that wanders
 - halt     it comes to rest where both feet are on the floor and hardly move, stays a while, and goes on
 - into     its cycle is blended with another's, in step (Rose, Cohen, Bodenheimer 1998, "Verbs and adverbs"), by a share
@@ -28,6 +29,8 @@ from kinetok.motion.kinematics import kinematics
 VARIED = "-varied"
 FPS = 60.0
 WANDER = 1.5  # seconds from one random value of turn or tempo to the next
+CHANGE = 3.0  # seconds from one share of another gait to the next
+SIDEWAYS = 2.2  # m/s^2 towards the inside of a turn at most, the pace of a jog that turns by 45 degrees/s
 RAMP = 0.5  # seconds to stop or to start
 STAY = (0.5, 2.5)  # seconds a halt lasts
 QUIET = 0.7  # m/s: the fastest foot of a moment at which a body can halt
@@ -66,7 +69,7 @@ def vary(
     bent, speed = _wander(rng, steps) * np.radians(turn), tempo ** _wander(rng, steps)
     source = f"varied by turn {turn:g} deg/s, tempo {tempo:g}, halt {halt:g} s, seed {seed}"
     if into is not None:
-        share = (0.5 + DWELL * _wander(rng, steps)).clip(0, 1)
+        share = (0.5 + DWELL * _wander(rng, steps, CHANGE)).clip(0, 1)
         qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
         source = f"{clip.source} into {into.source}, {source}"
         return replace(clip, name=name, fps=FPS, qpos=_bend(qpos, bent * speed), loop=False, source=source)
@@ -83,9 +86,9 @@ def vary(
     )  # fmt: skip
 
 
-def _wander(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """A smooth random signal (steps,) within [-1, 1]: cosines from one random value to the next."""
-    every = round(WANDER * FPS)
+def _wander(rng: np.random.Generator, steps: int, seconds: float = WANDER) -> np.ndarray:
+    """A smooth random signal (steps,) within [-1, 1]: cosines from one random value to the next, `seconds` later."""
+    every = round(seconds * FPS)
     knots = rng.uniform(-1, 1, steps // every + 2)
     index, share = np.divmod(np.arange(steps), every)
     share = (1 - np.cos(np.pi * share / every)) / 2
@@ -160,21 +163,21 @@ def _leads(clip: Clip) -> float:
 
 
 def _bend(qpos: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Poses (T, nq) whose path turns by rate (T,) radians per second more than it did, leaning into the turn."""
+    """Poses (T, nq) whose path turns by rate (T,) radians per second more than it did, leaning into the turn.
+
+    Where that would take more than SIDEWAYS, it turns by less.
+    """
+    step = np.diff(qpos[:, :2], axis=0)
+    speed = _smooth(np.linalg.norm(step, axis=1) * FPS)[: len(qpos)]
+    rate = rate.clip(-SIDEWAYS / speed.clip(1e-6), SIDEWAYS / speed.clip(1e-6))
     angle = np.concatenate([[0.0], np.cumsum(rate[:-1])]) / FPS
     half = (angle[1:] + angle[:-1]) / 2
-    step = np.diff(qpos[:, :2], axis=0)
     cos, sin = np.cos(half), np.sin(half)
     path = np.stack([cos * step[:, 0] - sin * step[:, 1], sin * step[:, 0] + cos * step[:, 1]], axis=1)
     out = qpos.copy()
     out[1:, :2] = qpos[0, :2] + np.cumsum(path, axis=0)
     # Lean about the point on the floor below the root, towards the centre of the turn, by the path's own mean speed.
-    window = min(round(FPS), len(path))
-    speed = np.linalg.norm(path, axis=1) * FPS
-    speed = np.convolve(
-        np.pad(speed, (window // 2, window - window // 2), mode="edge"), np.ones(window) / window, "valid"
-    )
-    lean = np.arctan(speed[: len(qpos)] * rate / GRAVITY)
+    lean = np.arctan(speed * rate / GRAVITY)
     along = rotation.heading(qpos[:, 3:7]) + angle
     axis = np.stack([np.cos(along), np.sin(along), np.zeros_like(along)], axis=1)
     tilt = rotation.from_rotvec(-lean[:, None] * axis)
@@ -183,3 +186,10 @@ def _bend(qpos: np.ndarray, rate: np.ndarray) -> np.ndarray:
     out[:, 3:7] = rotation.multiply(tilt, rotation.multiply(rotation.about_z(angle), qpos[:, 3:7]))
     out[:, :3] = np.concatenate([out[:, :2], np.zeros((len(qpos), 1))], axis=1) + rotation.rotate(tilt, above)
     return out
+
+
+def _smooth(speed: np.ndarray) -> np.ndarray:
+    """Means (T + 1,) of speed (T,) over about a second, of which one more fit in than there were steps."""
+    window = min(round(FPS), len(speed))
+    padded = np.pad(speed, (window // 2, window - window // 2), mode="edge")
+    return np.convolve(padded, np.ones(window) / window, "valid")

@@ -104,7 +104,7 @@ def distill(
     task.weights = ClipWeights(len(table.names), bounds=(config.focus**-0.5, config.focus**0.5))
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     flags = mirrored or [False] * len(teachers)
-    views = [_View(teacher.eval(), task, flag) for teacher, flag in zip(teachers, flags, strict=True)]
+    views = _Views([_View(teacher.eval(), task, flag) for teacher, flag in zip(teachers, flags, strict=True)])
     learner = _View(student, task, False)
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
@@ -130,7 +130,7 @@ def distill(
         while step < total:
             with torch.no_grad(), torch_threads(1):
                 action = learner.act(obs)
-                target = _label(views, obs, task)
+                target = views.label(obs, task.clip)
                 rows = torch.arange(cursor, cursor + config.rows) % config.memory
                 memory[rows], labels[rows] = obs, target
                 cursor, filled = cursor + config.rows, min(filled + config.rows, config.memory)
@@ -196,14 +196,23 @@ class _View:
         return self.mirror.action(self.tokenizer.act(self.mirror.observation(own))[0])
 
 
-def _label(views: list[_View], obs: Tensor, task: Tracking) -> Tensor:
-    target = torch.empty(len(obs), task.character.nu)
-    clip = torch.from_numpy(task.clip)
-    for index, view in enumerate(views):
-        ids = torch.nonzero(clip == index).flatten()
-        if len(ids):
-            target[ids] = view.act(obs[ids])
-    return target
+class _Views:
+    """Every clip's view of its teacher; clips that share a teacher, seen alike, are labelled together."""
+
+    def __init__(self, views: Sequence[_View]):
+        kinds = [(id(view.tokenizer), view.mirror is None) for view in views]
+        self._different = [views[kinds.index(kind)] for kind in dict.fromkeys(kinds)]
+        self._of_clip = torch.tensor([list(dict.fromkeys(kinds)).index(kind) for kind in kinds])
+
+    def label(self, obs: Tensor, clip: np.ndarray) -> Tensor:
+        """PD targets (N, nu) for observations (N, O) of rows that follow the clips (N,)."""
+        owner = self._of_clip[torch.from_numpy(clip)]
+        acted = [(ids, view.act(obs[ids])) for k, view in enumerate(self._different)
+                 if len(ids := torch.nonzero(owner == k).flatten())]  # fmt: skip
+        target = torch.empty(len(obs), acted[0][1].shape[1])
+        for ids, action in acted:
+            target[ids] = action
+        return target
 
 
 def _regress(student: MotionTokenizer, optimizer: torch.optim.Optimizer, obs: Tensor, target: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from kinetok.checkpoint import load_artifact, load_state, refuse_foreign, save_artifact
+from kinetok.checkpoint import load_artifact, load_state, locate, refuse_foreign, save_artifact
 from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
@@ -80,9 +80,10 @@ def _polish() -> PPOStage:
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
     """stages; tokenizer: the student; teacher_tokenizer: its experts; the three stages' own settings; mirror: the
-    student learns every clip's mirror image too, from the same teacher; teacher_start: artifact directory of a teacher
-    whose weights every new one begins with, or a folder of such directories by the names of clips; workers:
-    teachers that train at once."""
+    student learns every clip's mirror image too, from the same teacher; teacher_start: tokenizer (artifact directory or
+    packaged name) whose weights every new teacher begins with, or a folder of such directories by the names of clips;
+    teachers: tokenizer that teaches the student every clip, or such a folder, instead of those in `out`; start:
+    tokenizer whose weights the student begins with; workers: teachers that train at once."""
 
     stages: tuple[str, ...] = STAGES
     tokenizer: TokenizerConfig = TokenizerConfig()
@@ -92,6 +93,8 @@ class FitConfig:
     ppo: PPOStage = field(default_factory=_polish)
     mirror: bool = False
     teacher_start: str = ""
+    teachers: str = ""
+    start: str = ""
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -141,6 +144,12 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     images = [clip.mirror() for clip in clips] if config.mirror else []
     table = ReferenceTable(ClipLibrary.of([*clips, *images]), control_hz=config.tokenizer.scene.control_hz)
     student = new_tokenizer(config.tokenizer, table, seed)
+    parents: dict[str, str] = {}
+    if config.start:
+        start = MotionTokenizer.from_pretrained(config.start)
+        _refuse_other_shape(f"start {config.start}", config.tokenizer, start)
+        student.load_state_dict(start.state_dict())
+        parents = {"start": start.hash}
     if student.quantizer.levels:
         student.layout  # noqa: B018  refuses codes that do not divide into tokens, before hours of training
     refuse_foreign(out)
@@ -149,12 +158,14 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     scores: dict[str, TrackingScore] = {}
     if "teacher" in config.stages:
         train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
-    story: list[str] = []
-    parents: dict[str, str] = {}
+    story = ["start"] if config.start else []
     if "distill" in config.stages:
-        teachers = [MotionTokenizer.from_pretrained(out / "teachers" / name) for name in names]
-        parents = {f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in names}
-        story = ["teacher", "distill"]
+        folder = config.teachers or str(out / "teachers")
+        places = [_place_of("teachers", folder, name) for name in names]
+        known = {place: MotionTokenizer.from_pretrained(place) for place in dict.fromkeys(places)}
+        teachers = [known[place] for place in places]
+        parents |= {f"teacher/{name}": teacher.hash for name, teacher in zip(names, teachers, strict=True)}
+        story += ["teacher", "distill"]
         scores["distill"] = distill(
             student,
             teachers * 2 if images else teachers,
@@ -163,7 +174,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             out / "distill",
             seed=seed,
             threads=threads,
-            card=lambda score: tokenizer_card(student, table.names, "teacher -> distill", seed, score),
+            card=lambda score: tokenizer_card(student, table.names, " -> ".join(story), seed, score),
             mirrored=[False] * len(clips) + [True] * len(images),
             parents=parents,
         )
@@ -297,22 +308,34 @@ def _settings(config: FitConfig) -> TokenizerConfig:
     return replace(config.teacher_tokenizer, character=config.tokenizer.character, scene=config.tokenizer.scene)
 
 
+def _place_of(setting: str, path: str, name: str) -> Path:
+    """The tokenizer at `path`, by directory or packaged name, or that of clip `name` in the folder there."""
+    place = locate(path)
+    if (place / "config.json").exists():
+        return place
+    if not place.is_dir():
+        raise ConfigError(
+            f"{setting} {path}: no such directory; give a tokenizer's, or a folder of them by clips' names"
+        )
+    return place / name
+
+
 def _start(config: FitConfig, name: str) -> tuple[MotionTokenizer | None, dict[str, str]]:
     """The teacher that the one of clip `name` begins with, and its hash by role; nothing where there is none."""
-    path = Path(config.teacher_start)
     if not config.teacher_start:
         return None, {}
-    if not (path / "config.json").exists():
-        if not path.is_dir():
-            raise ConfigError(f"teacher_start {path}: no such directory; give a teacher's, or a folder of them")
-        path /= name
-        if not path.exists():
-            return None, {}
+    path = _place_of("teacher_start", config.teacher_start, name)
+    if not path.exists():
+        return None, {}
     start = MotionTokenizer.from_pretrained(path)
-    changed = diff(to_dict(_settings(config)), to_dict(start.config))
-    if changed:
-        raise ConfigError(f"teacher_start {path} is of another shape: {'; '.join(changed)}")
+    _refuse_other_shape(f"teacher_start {path}", _settings(config), start)
     return start, {"start": start.hash}
+
+
+def _refuse_other_shape(what: str, wanted: TokenizerConfig, found: MotionTokenizer) -> None:
+    changed = diff(to_dict(wanted), to_dict(found.config))
+    if changed:
+        raise ConfigError(f"{what} is of another shape: {'; '.join(changed)}")
 
 
 def _teach(

@@ -53,6 +53,26 @@ def done(clips, small, tmp_path_factory):
     return out, fit(clips, small, out, seed=0)
 
 
+def test_another_tokenizer_teaches_and_another_one_is_gone_on_with(done, clips, small, tmp_path):
+    out, tokenizer = done
+    later = override(small, ["stages=distill", f"teachers={out}", f"start={out}"])
+    taught = fit(clips, later, tmp_path / "one", seed=0)
+    parents = load_artifact(tmp_path / "one").parents
+    assert parents == dict.fromkeys(("start", "teacher/wave", "teacher/sweep"), tokenizer.hash)
+    apart = override(small, ["stages=distill", f"teachers={out / 'teachers'}"])
+    fit(clips, apart, tmp_path / "two", seed=0)
+    assert load_artifact(tmp_path / "two").parents == {
+        f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in ("wave", "sweep")
+    }
+    # It began where the other one was: what it does is nearer to it than what a fresh student does.
+    obs = torch.randn(64, sum(tokenizer.sizes.values()), generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        wanted, began, fresh = (
+            t.act(obs)[0] for t in (tokenizer, taught, MotionTokenizer.from_pretrained(tmp_path / "two"))
+        )
+    assert (began - wanted).norm() < 0.5 * (fresh - wanted).norm()
+
+
 def test_every_stage_leaves_its_artifact(done):
     out, tokenizer = done
     for path in ("teachers/wave", "teachers/sweep", "distill", "ppo", "."):
@@ -250,6 +270,11 @@ def other_body(tmp_path) -> Clip:
             lambda clips, small, tmp_path: (clips, override(small, ["teacher.rows=0"])),
             ConfigError,
             "config.teacher: rows must be at least 1, not 0",
+        ),
+        (
+            lambda clips, small, tmp_path: (clips, override(small, ["start=humanoid-fsq"])),
+            ConfigError,
+            "start humanoid-fsq is of another shape: ",
         ),
         (
             lambda clips, small, tmp_path: (clips, override(small, ["tokenizer.scalars=4"])),
