@@ -127,6 +127,7 @@ class Training:
                     if score.merit > progress.best:
                         progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
                         keep(score)
+                metrics["reward"] = float(rollout.rewards.mean())  # a step; episodes' sums are of whole episodes alone
                 log.write(progress.samples, metrics | self.world.episode_metrics())
                 if due:
                     self.save(progress)
