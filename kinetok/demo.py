@@ -3,8 +3,8 @@
     run_demo(Path("kinetok-demo"))
 
 It tracks a packaged clip, prints its tokens, plays the tokens back without the clip, lets the prior move the
-character by itself, writes a video of each and a small table. The packaged clips are recordings of our own
-simulated roll-outs.
+character by itself, has an adapter of the prior walk to targets, and writes a video of each and a small table. The
+packaged clips are recordings of our own simulated roll-outs.
 """
 
 import time
@@ -14,6 +14,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from kinetok.adapters.finetune import Skill
+from kinetok.adapters.rlft import play
 from kinetok.checkpoint import PACKAGED
 from kinetok.evaluate import measure
 from kinetok.gpt.controller import Prior, roll
@@ -25,10 +27,11 @@ from kinetok.tokenizers.codec import decode_tokens, encode_clip
 
 CLIPS = PACKAGED / "clips.safetensors"
 PRIOR = "humanoid-gpt"
+SKILL = "humanoid-target"
 
 
 def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console | None = None) -> dict[str, float]:
-    """Write tracked.mp4, sampled.mp4 and sampled.png (stills) into `out`; returns the numbers of the table."""
+    """Write tracked.mp4, sampled.mp4, sampled.png (stills) and target.mp4 into `out`; returns the table's numbers."""
     console = console or Console()
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
@@ -58,12 +61,21 @@ def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console
     write_video(out / "sampled.mp4", frames, fps)
     write_strip(out / "sampled.png", body, recording.qpos[: 4 * fps, best], columns=8)
 
-    sampled = measure(recording)
+    console.print(f"[bold]4.[/] Walking to targets for {2 * seconds:g} s, with an adapter of the prior")
+    skill = Skill.from_pretrained(SKILL)
+    done = play(skill.controller(seed), skill.task, skill.prior, episodes=16, seconds=2 * seconds, seed=seed, record=1)
+    frames = render_frames(
+        body, done.qpos[:, 0], fps=fps, markers=done.markers, caption="target", distance=4.5, elevation=-28
+    )
+    write_video(out / "target.mp4", frames, fps)
+
+    sampled, reached = measure(recording), done.score.measures["success_rate"]
     numbers = {
         "tracked_mpjpe_mm": error,
         "replay_difference": same,
         "sampled_upright": sampled["survival_rate"],
         "sampled_path_m": sampled["path_m"],
+        "targets_reached": reached,
         "seconds": time.monotonic() - started,
     }
     table = Table(show_header=False)
@@ -73,7 +85,8 @@ def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console
     table.add_row("tokens a second", f"{fps * stream.layout.tokens_per_step} of {stream.layout.vocabulary}")
     table.add_row(f"upright after {seconds:g} s of sampling", f"{100 * sampled['survival_rate']:.0f} % of 8")
     table.add_row("distance covered while sampling", f"{sampled['path_m']:.1f} m")
-    table.add_row("videos", f"{out / 'tracked.mp4'}, {out / 'sampled.mp4'}")
+    table.add_row("targets reached", f"{100 * reached:.0f} % of {done.score.measures['counts']['success_rate']}")
+    table.add_row("videos", f"{out / 'tracked.mp4'}, {out / 'sampled.mp4'}, {out / 'target.mp4'}")
     table.add_row("time", f"{numbers['seconds']:.0f} s")
     console.print(table)
     return numbers

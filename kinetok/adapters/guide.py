@@ -76,6 +76,7 @@ def demonstrate(
     layout, scene = tokenizer.layout, tokenizer.config.scene
     rng = np.random.default_rng([seed, 5])
     task = Matching(TrackingConfig(future=tokenizer.config.future), table, rows=rows, rng=rng)
+    task.driven[::2] = driver is not None
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part, asked = -(-samples // rows), task.layout["state"], goal.layout["task"]
     states = torch.empty(steps, rows, part.stop - part.start)

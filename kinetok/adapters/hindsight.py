@@ -54,14 +54,14 @@ class HindsightConfig:
     directions of what was asked and of what was fulfilled are counted in so many, and samples drawn so that both are
     alike; boost: at most so much more often."""
 
-    rounds: int = 4
+    rounds: int = 5
     rows: int = 512
     seconds: float = 10.0
-    iterations: int = 400
+    iterations: int = 500
     batch: int = 512
     lr: float = 3e-3
-    memory: int = 2
-    samples: int = 200_000
+    memory: int = 5
+    samples: int = 250_000
     code_noise: float = 0.05
     matching: bool = True
     restless: tuple[float, float] = (0.4, 4.0)
@@ -177,14 +177,14 @@ def demonstrated(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What `relabel` returns, of the frozen tokenizer on the table's clips: matched to the task, or as they are.
 
-    generator: with one, the policy acts in half of the rows of a third as many steps.
+    generator: with one, the policy acts in half of the rows of half as many steps.
     """
     told = {"samples": config.samples, "rows": config.rows, "seed": seed, "threads": threads, "quiet": quiet}
     told |= {"env": config.env, "code_noise": config.code_noise}
     if not config.matching:
         return relabel(roam(policy.tokenizer, table, transitions=config.transitions, **told), env, config, seed)
     if generator is not None:
-        told |= {"samples": config.samples // 3, "driver": policy.controller(generator)}
+        told |= {"samples": config.samples // 2, "driver": policy.controller(generator)}
     goal = asking or cast(Goal, env.task)
     states, c, tokens = demonstrate(policy.tokenizer, table, goal, doomed=config.doomed, **told)
     return states, c, tokens, torch.ones(len(states))

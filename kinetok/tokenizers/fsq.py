@@ -37,12 +37,14 @@ MOST_LEVELS = 1000
 
 @dataclass(frozen=True, kw_only=True)
 class FSQConfig:
-    """kind: "fsq". dim: scalars per latent. levels: L, values per scalar. bound: see FSQ."""
+    """kind: "fsq". dim: scalars per latent. levels: L, values per scalar. bound: see FSQ. unit: the latent is brought
+    to a root mean square of one before it is bounded."""
 
     kind: Literal["fsq"] = "fsq"
     dim: int = 24
     levels: int = 9
     bound: Bound = "gpc"
+    unit: bool = False
 
 
 class FSQ(Quantizer):
@@ -54,10 +56,15 @@ class FSQ(Quantizer):
                       s = atanh(o / w), so that z = 0 is bounded to 0 at even L too
 
     level = round(bound(z)) in -h .. L-1-h;  value = level / h;  code = level + h in 0..L-1.
+
+    unit=True puts z / rms(z) in the place of z (ours). Reinforcement learning from nothing drives the encoder to where
+    tanh is flat: after 0.4 million samples 99 % of the scalars lie at an outermost level and no gradient brings them
+    back (docs/log.md). Of unit size they cannot all go there.
     """
 
-    def __init__(self, dim: int, levels: int = 9, bound: Bound = "gpc"):
+    def __init__(self, dim: int, levels: int = 9, bound: Bound = "gpc", unit: bool = False):
         super().__init__()
+        self._unit = unit
         if dim < 1:
             raise ValueError(f"FSQ needs dim >= 1, not {dim}")
         if not 2 <= levels <= MOST_LEVELS:
@@ -72,6 +79,8 @@ class FSQ(Quantizer):
 
     def bound(self, z: Tensor) -> Tensor:
         """z (N, dim) -> the bounded value before rounding (N, dim), in units of levels."""
+        if self._unit:
+            z = z * torch.rsqrt(z.pow(2).mean(-1, keepdim=True) + 1e-6)
         return self._width * torch.tanh(z + self._shift) - self._offset
 
     def forward(self, z: Tensor) -> Quantized:

@@ -99,3 +99,16 @@ def test_mentzer_agrees_with_vector_quantize_pytorch(levels):
     torch.testing.assert_close(ours.values, values)
     # The oracle's index has its first scalar least significant.
     torch.testing.assert_close((ours.codes * levels ** torch.arange(4)).sum(-1), index.long())
+
+
+def test_a_latent_of_unit_size_keeps_its_gradient_however_large_it_is():
+    z = torch.randn(64, 12, generator=torch.Generator().manual_seed(0)) * 50
+    flat, kept = z.clone().requires_grad_(), z.clone().requires_grad_()
+    saturated, spread = FSQ(dim=12)(flat), FSQ(dim=12, unit=True)(kept)
+    assert saturated.metrics["saturation"] > 0.9 and spread.metrics["saturation"] < 0.3
+    for values in (saturated.values, spread.values):
+        values.pow(2).sum().backward()
+    # How many scalars would move by a step of the latent's own size along its straight-through gradient.
+    moved = [float((50 * x.grad.abs() > 1e-2).float().mean()) for x in (flat, kept)]
+    assert moved[0] < 0.1 and moved[1] > 0.8
+    assert torch.equal(spread.codes, FSQ(dim=12, unit=True)(z / 1000).codes)

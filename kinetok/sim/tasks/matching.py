@@ -8,6 +8,9 @@
 Motion matching (Clavet 2016, "Motion matching and the road to next-gen animation") as a demonstrator: of all frames
 that resemble the body, a row goes on in the one whose own next second comes nearest to the wish, unless the clip it is
 in does as well. The tracker that follows shows what tokens such a wish takes.
+
+A row that something else drives (`driven`) need not stay near what it follows: what it follows is found anew wherever
+the body is, and only a fall ends it.
 """
 
 import numpy as np
@@ -21,10 +24,12 @@ SEARCHES = 5.0  # a second, each row at moments of its own
 REACH = 0.15  # metres of `likeness`: frames of one gait, of which a varied one has many, are nearer than that
 LIKENESS = 4.0  # weight of the squared likeness, against the squared metres by which a wish is missed
 MARGIN = 0.02  # square metres by which another frame must be better
+DRIVEN_REACH = 0.6  # metres of `likeness` for a driven row
+FALLEN = 0.5  # metres of the root
 
 
 class Matching(Roaming):
-    """wish (rows, 2): where the root should be in a second, in metres in its heading frame."""
+    """wish (rows, 2): where the root should be in a second, in metres in its heading frame. driven (rows,) bool."""
 
     def __init__(
         self,
@@ -37,6 +42,7 @@ class Matching(Roaming):
     ):
         super().__init__(config, table, rows=rows, transitions=SEARCHES, rng=rng, reach=reach, reach_at_end=2 * reach)
         self.wish = np.zeros((rows, 2), np.float32)
+        self.driven = np.zeros(rows, bool)
         last = np.repeat(table.last, table.last - table.first + 1)
         ahead = np.arange(len(last)) + table.control_hz
         step = np.concatenate(
@@ -45,18 +51,27 @@ class Matching(Roaming):
         self.second = rotation.turn(step, np.cos(table.heading), -np.sin(table.heading))[:, :2].astype(np.float32)
         self._whole = ahead <= last
 
+    def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
+        self.grace[self.driven] = 2  # no error is a failure
+        terminated, over = super().over(body)
+        terminated |= self.driven & (body.pos[:, 0, 2] < FALLEN)
+        self.landing[terminated] = -1
+        return terminated, over & ~terminated
+
     def _nearest(self, body: BodyState, ids: np.ndarray, left: np.ndarray) -> np.ndarray:
-        entries = self._entries
-        squares = entries.squares(likeness(body))
+        entries, seen = self._entries, likeness(body)
+        squares = entries.squares(seen)
         missed = self.second[entries.frames] - self.wish[ids][:, None]
         cost = LIKENESS * squares + np.einsum("nek,nek->ne", missed, missed)
         beside = np.abs(entries.frames - self.frame[ids][:, None]) < self.tail
-        near = np.where(left[:, None] <= 0, self._reach_at_end, self._reach) ** 2
+        near = np.where(left <= 0, self._reach_at_end, self._reach)
+        near = np.maximum(near, np.where(self.driven[ids], DRIVEN_REACH, 0.0))[:, None] ** 2
         cost[(squares > near) | ~self._whole[entries.frames] | (beside & (entries.owner == self.clip[ids, None]))] = (
             np.inf
         )
         best = cost.argmin(1)
-        stay = ((self.second[self.frame[ids]] - self.wish[ids]) ** 2).sum(1)
+        apart = seen - likeness(self.table.body.rows(self.frame[ids]))
+        stay = ((self.second[self.frame[ids]] - self.wish[ids]) ** 2).sum(1) + LIKENESS * (apart**2).sum(1)
         stay[left <= self.tail] = np.inf
         lowest = cost[np.arange(len(ids)), best]
         return np.where(np.isfinite(lowest) & (lowest < stay - MARGIN), entries.frames[best], -1)

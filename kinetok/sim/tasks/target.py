@@ -22,7 +22,7 @@ from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_hea
 
 AHEAD = 2.0  # seconds that hindsight looks ahead at most
 WALKING, RESTING = 0.4, 0.15  # m/s over half a second
-STRIDE = 1.2  # metres that a demonstration wants to come nearer in a second
+STRIDE = 1.8  # metres that a demonstration wants to come nearer in a second
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,3 +55,28 @@ def test_a_clip_that_does_as_wished_is_not_left(humanoid):
     for _ in range(40):
         task.over(env.sim.state())
         assert (task.landing == -1).all()
+
+
+def test_a_driven_row_is_found_again_and_only_a_fall_ends_it(humanoid):
+    table = ReferenceTable(ClipLibrary.of([turning(humanoid, "left", 1.0, 0)]))
+    task = Matching(TrackingConfig(future=(1, 2)), table, rows=4, rng=np.random.default_rng(0))
+    task.driven[:] = [True, True, False, False]
+    env = Env(EnvConfig(), task, rows=4, threads=1)
+    env.reset()
+    frame = np.full(4, 20)
+    task.place(np.arange(4), np.zeros(4, int), frame)
+    qpos, qvel = table.qpos[frame].copy(), table.qvel[frame]
+    qpos[:, 1] += [3.0, 3.0, 3.0, 0.0]  # far from what they follow, though they resemble it
+    qpos[1, 2] = 0.3
+    env.sim.set_state(np.arange(4), qpos, qvel)
+    terminated, over = task.over(env.sim.state())
+    assert terminated.tolist() == [False, True, True, False] and not over.any()
+    assert (task.landing[[1, 2]] == -1).all()
+    task.wish[:] = task.second[60]  # it now wants to turn, and goes on where the clip does
+    for _ in range(60):
+        task.over(env.sim.state())
+        task.land(env, task.observe(env.sim.state()))
+        if task.frame[0] != 20:
+            break
+    root = env.sim.state().pos[0, 0, :2]
+    assert task.frame[0] >= 30 and np.linalg.norm(root - table.root[task.frame[0], :2]) < 1e-3
