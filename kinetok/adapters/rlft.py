@@ -114,14 +114,14 @@ class TokenPolicy:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskScore:
-    """measures: of a Scorecard. merit: the return, rewards up to a row's first fall, where training's episodes end
-    too: what comes after one is not what was trained."""
+    """measures: of a Scorecard. merit: the reward of a step, none while a row is down. The return, which ends with a
+    row's first fall, prefers a skill that does nothing and never falls to one that does its task and gets up again."""
 
     measures: dict[str, Any]
 
     @property
     def merit(self) -> float:
-        return self.measures["return"]
+        return self.measures["reward"]
 
     def summary(self) -> dict[str, float]:
         return {name: value for name, value in self.measures.items() if isinstance(value, float)}

@@ -121,13 +121,13 @@ def test_the_best_evaluation_is_kept(models, tmp_path, monkeypatch):
 
     def judged(*args, **options):
         played = real(*args, **options)
-        measures = played.score.measures | {"return": next(merits)}
+        measures = played.score.measures | {"reward": next(merits)}
         return replace(played, score=replace(played.score, measures=measures))
 
     monkeypatch.setattr(room, "play", judged)
     skill = run(models, tmp_path)
     assert load_state(tmp_path / "state.safetensors")[1]["progress"]["best"] == 2.0
-    assert "| return | 2.000 |" in (tmp_path / "README.md").read_text()
+    assert "| reward | 2.000 |" in (tmp_path / "README.md").read_text()
     last = load_state(tmp_path / "state.safetensors")[0]
     name = next(name for name in weights(tmp_path) if "lora_B" in name)
     kept, trained = skill.adapted.adapter_state()[name], last[f"tree.adapter.{name}"]

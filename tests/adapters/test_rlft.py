@@ -157,7 +157,7 @@ def test_reward_moves_the_tokens_within_the_nucleus_and_by_the_task_alone(tmp_pa
         kinds={},
         seed=0,
     )
-    score = TaskScore(measures={"return": 0.0})
+    score = TaskScore(measures={"reward": 0.0})
     run.train(samples=25 * 512, eval_every=10**9, evaluate=lambda: score, keep=lambda found: None, quiet=True)
     first = np.concatenate([action[:, 0] for action in world.seen[:4]])
     assert 0.1 < (first == 2).mean() < 0.3  # .15 / .85 at the start
@@ -198,7 +198,7 @@ def test_playing_depends_on_the_seed_and_not_on_the_threads(prior, task):
     assert one.qpos.shape == (15, 2, prior.character.nq) and len(one.markers) == 15 and one.fps == 30
     other = play(blind(prior), task, prior, episodes=3, seconds=0.5, threads=1, seed=2, record=2)
     assert not np.array_equal(one.qpos, other.qpos)
-    assert one.score.merit == one.score.measures["return"] and one.score.measures["episodes"] == 3
+    assert one.score.merit == one.score.measures["reward"] and one.score.measures["episodes"] == 3
     assert all(isinstance(value, float) for value in one.score.summary().values())
     json.dumps(one.score.to_json(), allow_nan=False)
 

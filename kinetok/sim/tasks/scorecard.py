@@ -33,7 +33,7 @@ class Scorecard:
             if np.shape(values) != (self.rows,):
                 raise ValueError(f"{name} has shape {np.shape(values)}; this scorecard is of {self.rows} rows")
         self.steps += 1
-        self._reward += reward
+        self._reward += np.where(terminated, 0.0, reward)
         self._return += np.where(self._fell, 0.0, reward)
         self._fell, self._down = self._fell | terminated, terminated.copy()
         for name, values in measures.items():
@@ -43,7 +43,7 @@ class Scorecard:
 
     def summary(self) -> dict[str, Any]:
         """Means: every measure over the rows and steps where it is defined (None where it never was, counts says how
-        many those are); reward a step; return, the rewards up to a row's first failure; survival_rate (GPC app. C.3:
+        many those are); reward a step, none while a row is down; return, the rewards up to a row's first failure; survival_rate (GPC app. C.3:
         not down at the last step, whatever came before) and never_fell_rate."""
         if not self.steps:
             raise ValueError("nothing to sum up; add a step first")

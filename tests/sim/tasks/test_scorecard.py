@@ -20,7 +20,7 @@ def test_means_by_hand():
     found = card.summary()
     assert found["d"] == pytest.approx(3.5) and found["success_rate"] == pytest.approx(2 / 3)
     assert found["counts"] == {"d": 6, "success_rate": 3}
-    assert found["reward"] == pytest.approx((3 + 1.2) / 6)
+    assert found["reward"] == pytest.approx((3 + 0.7) / 6)  # nothing for row 1 while it is down
     # row 0: 3; row 1: .5 + .5 up to its fall
     assert found["return"] == pytest.approx((3 + 1.0) / 2)
     assert found["survival_rate"] == 1.0 and found["never_fell_rate"] == 0.5  # it got up
