@@ -149,7 +149,7 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """Two million control steps; no run of it has learned its task yet (docs/log.md)."""
+    """Demonstrations in a quarter of an hour, two million control steps of reward: docs/tutorial.md."""
     return FinetuneConfig()
 
 

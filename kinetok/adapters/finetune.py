@@ -67,11 +67,11 @@ class FinetuneConfig:
     eval_episodes: int = 64
     eval_seconds: float = 20.0
     critic: tuple[int, ...] = (256, 128)
-    critic_warmup: int = 5
+    critic_warmup: int = 6
     env: EnvConfig = EnvConfig(episode_seconds=16.0)
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            epochs=2, minibatch=2048, gamma=0.99, lr=3e-4, lr_max=1e-3, target_kl=0.015, critic_lr=1e-3
+            horizon=32, epochs=2, minibatch=4096, gamma=0.99, lr=1e-4, lr_max=3e-4, target_kl=0.004
         )
     )
 
