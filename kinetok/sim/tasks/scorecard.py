@@ -43,8 +43,8 @@ class Scorecard:
 
     def summary(self) -> dict[str, Any]:
         """Means: every measure over the rows and steps where it is defined (None where it never was, counts says how
-        many those are); reward a step, none while a row is down; return, the rewards up to a row's first failure; survival_rate (GPC app. C.3:
-        not down at the last step, whatever came before) and never_fell_rate."""
+        many those are); reward a step, none while a row is down; return, the rewards up to a row's first failure;
+        survival_rate (GPC app. C.3: not down at the last step, whatever came before) and never_fell_rate."""
         if not self.steps:
             raise ValueError("nothing to sum up; add a step first")
         means = {name: self._sums[name] / count if count else None for name, count in self._counts.items()}
