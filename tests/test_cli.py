@@ -226,7 +226,7 @@ def skill(prior, clip, tmp_path_factory) -> Path:
     assert result.exit_code == 0, result.output
     # 2 tokens of 125, width 16, one block: A and B of rank 2 on 64, 32, 80 and 80 sides, the token's net of 8.
     first = result.output.splitlines()[0]
-    assert first.startswith(f"lora adapter of {2 * 256 + 3 * 8 + 9 * 16:,} parameters, ") and "stay frozen" in first
+    assert first.startswith(f"lora adapter of {2 * 256 + 5 * 8 + 9 * 16:,} parameters, ") and "stay frozen" in first
     assert "best evaluation: " in result.output and str(out) in result.output
     return out
 
@@ -359,7 +359,7 @@ WRONG = {
     "same clip twice": (lambda p, c, r, t: (*FIT, c, "--clips", c), "two clips are named 'wave'; rename a file"),
     "preset": (
         lambda p, c, r, t: (*FIT, c, "--preset", "one-clp"),
-        "unknown preset 'one-clp'; one of: one-clip, many-clips, from-scratch, tiny; did you mean 'one-clip'?",
+        "unknown preset 'one-clp'; one of: one-clip, many-clips, generalist, from-scratch, tiny; did you mean 'one-clip'?",
     ),
     "setting": (
         lambda p, c, r, t: (*FIT, c, "--set", "teacher.sample=5"),
