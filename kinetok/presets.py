@@ -112,7 +112,7 @@ FIT = {
 
 
 def laptop() -> PretrainConfig:
-    """A prior in ten minutes on two cores. It is not refined: where it may wander, that brings little."""
+    """A prior in ten minutes on two cores, half of it recorded while wandering, and not refined."""
     return PretrainConfig(
         width=128,
         layers=3,

@@ -9,8 +9,8 @@ the motion is the teacher. Steps before a fall are left out, so that what remain
 
 Two sources of motion: recorded clips, which the frozen tokenizer tracks, and the policy itself, which plays the task
 round after round. Clips are played as the task asks, by motion matching (`matching`), where nothing has to be
-relabelled, or as they are. Neither has brought a skill yet (docs/log.md): most of what is learned follows from the
-state, and little from what was asked.
+relabelled, or as they are. Relabelling alone has brought no skill (docs/log.md): most of what is learned follows from
+the state, and little from what was asked. Matched demonstrations have.
 
 Goal-conditioned supervised learning (Ghosh et al. 2021, "Learning to reach goals via iterated supervised
 learning"; of demonstrations, Ding et al. 2019, "Goal-conditioned imitation learning"), which GPC does not use:
