@@ -58,8 +58,8 @@ class FSQ(Quantizer):
     level = round(bound(z)) in -h .. L-1-h;  value = level / h;  code = level + h in 0..L-1.
 
     unit=True puts z / rms(z) in the place of z (ours). Reinforcement learning from nothing drives the encoder to where
-    tanh is flat: after 0.4 million samples 99 % of the scalars lie at an outermost level, where hardly a gradient passes
-    (docs/log.md). Of unit size they cannot all go there.
+    tanh is flat: after 0.4 million samples 99 % of the scalars lie at an outermost level, where hardly a gradient
+    passes (docs/log.md). Of unit size they cannot all go there.
     """
 
     def __init__(self, dim: int, levels: int = 9, bound: Bound = "gpc", unit: bool = False):
