@@ -5,6 +5,8 @@
 Any leaf is then changed by `--set key=value`.
 """
 
+from dataclasses import replace
+
 from kinetok.adapters.cola import CoLAConfig
 from kinetok.adapters.finetune import FinetuneConfig
 from kinetok.adapters.sft import SFTConfig
@@ -58,10 +60,8 @@ def generalist() -> FitConfig:
     """One continuous expert of many clips, to teach others: what `teachers` know, gone on with by PPO on all clips."""
     return FitConfig(
         stages=("distill", "ppo"),
-        tokenizer=TokenizerConfig(
-            quantizer=ContinuousConfig(dim=64), future=(1, 2, 7), encoder=(384,), decoder=(192,),
-            encoder_inputs=("state", "window", "error"), decoder_inputs=(), residual=True,
-        ),
+        tokenizer=replace(FitConfig().teacher_tokenizer, encoder=(384,), decoder=(192,),
+                          encoder_inputs=("state", "window", "error")),
         distill=DistillStage(samples=1_000_000, rows=512, transitions=0.15, reach_at_end=0.6, eval_every=250_000,
                              eval_episodes=4, save_every=1_000_000, env=EnvConfig(reset_noise=0.02, push=0.3)),
         ppo=PPOStage(samples=8_000_000, eval_every=300_000, eval_episodes=4, critic_warmup=10, arrivals=0.25,

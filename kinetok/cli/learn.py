@@ -47,11 +47,12 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")
 def finetune(prior, task, adapter, method, paths, start, out, preset, settings, threads, seed) -> None:
-    """Bend the frozen prior to a task with a small adapter: by reward (rl), by examples (sft), or one after the other.
+    """Bend the frozen prior to a task with a small adapter: by examples (sft), by demonstrations of the task that are
+    made of --clips (hindsight), by reward (rl), or one after the other.
 
     \b
     Presets: laptop (2 million steps on two cores), paper (GPC's sizes), tiny (tests).
-    kinetok finetune --task target --out runs/target
+    kinetok finetune --task target --method hindsight,rl --clips gaits.safetensors --out runs/target
     kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
     kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
     kinetok sample --adapter runs/target --out target.mp4

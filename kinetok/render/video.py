@@ -30,6 +30,7 @@ from kinetok.sim.tasks.marker import Marker
 GHOST = (0.96, 0.56, 0.20, 0.38)
 SKY, HAZE = (0.55, 0.68, 0.84), (0.90, 0.93, 0.96)
 DISTANCE, ELEVATION, THREE_QUARTERS = 3.1, -14.0, 138.0  # metres, degrees, degrees from the heading
+FROM_ABOVE = {"distance": 4.5, "elevation": -28.0}  # a camera that sees what a task asks for on the floor
 BONE, BONE_COLOUR, BONE_GROUP = 0.028, (0.30, 0.34, 0.42, 1.0), 2  # radius in metres
 SHADE_HEIGHT = 0.9
 FOLLOW_SECONDS = 0.5
