@@ -22,7 +22,7 @@ from kinetok.gpt.controller import Prior, roll
 from kinetok.metrics import mpjpe_mm
 from kinetok.motion.kinematics import kinematics
 from kinetok.motion.library import ClipLibrary
-from kinetok.render.video import FROM_ABOVE, render_frames, write_strip, write_video
+from kinetok.render.video import render_frames, render_task, write_strip, write_video
 from kinetok.tokenizers.codec import decode_tokens, encode_clip
 
 CLIPS = PACKAGED / "clips.safetensors"
@@ -64,7 +64,7 @@ def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console
     console.print(f"[bold]4.[/] Walking to targets for {2 * seconds:g} s, with an adapter of the prior")
     skill = Skill.from_pretrained(SKILL)
     done = play(skill.controller(seed), skill.task, skill.prior, episodes=16, seconds=2 * seconds, seed=seed, record=1)
-    frames = render_frames(body, done.qpos[:, 0], fps=fps, markers=done.markers, caption="target", **FROM_ABOVE)
+    frames = render_task(body, done.qpos[:, 0], done.markers, fps=fps, caption="target")
     write_video(out / "target.mp4", frames, fps)
 
     sampled, reached = measure(recording), done.score.measures["success_rate"]

@@ -60,7 +60,7 @@ def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, 
     from kinetok.adapters.rlft import play
     from kinetok.config import to_dict
     from kinetok.motion.clip import Clip
-    from kinetok.render.video import FROM_ABOVE, render_frames, write_video
+    from kinetok.render.video import render_task, write_video
 
     skill = Skill.from_pretrained(adapter, prior, tokenizer)
     skill = replace(skill, policy=replace(skill.policy, **drawn))
@@ -69,7 +69,7 @@ def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, 
         episodes=count, seconds=seconds, push=push, seed=seed, record=count,
     )  # fmt: skip
     body, name = skill.prior.character, skill.task.kind
-    frames = render_frames(body, played.qpos[:, 0], fps=played.fps, markers=played.markers, caption=name, **FROM_ABOVE)
+    frames = render_task(body, played.qpos[:, 0], played.markers, fps=played.fps, caption=name)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_video(out, frames, played.fps)
     click.echo(f"wrote {out}: {len(played.qpos)} frames at {played.fps:g} fps")

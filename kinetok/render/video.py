@@ -30,7 +30,6 @@ from kinetok.sim.tasks.marker import Marker
 GHOST = (0.96, 0.56, 0.20, 0.38)
 SKY, HAZE = (0.55, 0.68, 0.84), (0.90, 0.93, 0.96)
 DISTANCE, ELEVATION, THREE_QUARTERS = 3.1, -14.0, 138.0  # metres, degrees, degrees from the heading
-FROM_ABOVE = {"distance": 4.5, "elevation": -28.0}  # a camera that sees what a task asks for on the floor
 BONE, BONE_COLOUR, BONE_GROUP = 0.028, (0.30, 0.34, 0.42, 1.0), 2  # radius in metres
 SHADE_HEIGHT = 0.9
 FOLLOW_SECONDS = 0.5
@@ -87,6 +86,13 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def render_task(
+    character: Character, qpos: np.ndarray, markers: Sequence[Sequence[Marker]], *, fps: float, caption: str
+) -> Iterator[np.ndarray]:
+    """render_frames from further up, where the floor shows what a task asks for."""
+    return render_frames(character, qpos, fps=fps, markers=markers, caption=caption, distance=4.5, elevation=-28.0)
 
 
 def write_strip(
