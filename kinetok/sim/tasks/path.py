@@ -21,6 +21,8 @@ from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import AHEAD, GOAL, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
+CATCH_UP = 2.0  # seconds in which a demonstration returns to the path
+
 
 @dataclass(frozen=True, kw_only=True)
 class PathConfig:
@@ -32,7 +34,7 @@ class PathConfig:
     scale: float = 2.0
     waypoints: int = 10
     seconds: float = 5.0
-    speed: tuple[float, float] = (0.6, 1.5)
+    speed: tuple[float, float] = (0.7, 1.1)
     acceleration: float = 0.5
     turn: float = 0.6
     far: float = 0.0
@@ -136,9 +138,10 @@ class Path:
         return np.concatenate(parts, axis=-1), now + self.config.waypoints * self.arc <= ends
 
     def wish(self, c: np.ndarray) -> np.ndarray:
-        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, C)."""
+        """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, C): half
+        the way to where it should be in two, so that half of a lead or lag is made up for at a time (docs/log.md)."""
         points = c.reshape(len(c), -1, 2)
-        nearest = min(max(round(self.control_hz / self.arc), 1), points.shape[1])
+        nearest = min(max(round(CATCH_UP * self.control_hz / self.arc), 1), points.shape[1])
         return points[:, nearest - 1] * (self.control_hz / (self.arc * nearest))
 
     def markers(self, row: int) -> list[Marker]:

@@ -5,9 +5,10 @@
 
 The observation of a row is state | task (see `layout`): proprioception; the velocity asked for (direction times
 speed) and the facing asked for (a unit vector), both in the heading frame: 4 numbers. Ours, as the paper is silent:
-how often commands change, the speeds (a walk's to a slow jog's), and the facing, which nine times of ten is the
-direction: walking sideways and backwards is not among the recorded motions that come with the project. A speed of
-zero is never asked for: eq. 12 rewards no velocity against the direction, however small.
+how often commands change and by how much (a quarter turn at most), the speeds (a walk's; the packaged gaits have none
+between a walk's and a jog's), and the facing, which nine times of ten is the direction: walking sideways and backwards
+is not among the recorded motions. A speed of zero is never asked for: eq. 12 rewards no velocity against the
+direction, however small.
 """
 
 from dataclasses import dataclass, replace
@@ -37,8 +38,8 @@ class SteeringConfig:
     direction_weight: float = 0.7
     facing_weight: float = 0.3
     seconds: tuple[float, float] = (2.0, 5.0)
-    speed: tuple[float, float] = (0.5, 2.0)
-    turn: float = np.pi
+    speed: tuple[float, float] = (0.7, 1.2)
+    turn: float = np.pi / 2
     free_facing: float = 0.1
     fall_height: float = 0.5
 

@@ -79,7 +79,7 @@ def test_paths_are_smooth_endless_and_within_their_limits(humanoid):
             np.testing.assert_array_equal(task.points[1:], others)
     steps = np.diff(np.array(walked)[:, 1:].astype(np.float64), axis=0) * 30
     speed, angle = np.hypot(*np.moveaxis(steps, -1, 0)), np.unwrap(np.arctan2(steps[..., 1], steps[..., 0]), axis=0)
-    assert 0.6 - 1e-3 < speed.min() < 0.65 and 1.45 < speed.max() < 1.5 + 1e-3
+    assert 0.7 - 1e-3 < speed.min() < 0.75 and 1.05 < speed.max() < 1.1 + 1e-3
     assert np.abs(np.diff(speed, axis=0)).max() * 30 < 0.5 + 2e-2  # acceleration
     assert 0.55 < np.abs(np.diff(angle, axis=0)).max() * 30 < 0.6 + 2e-2  # turn rate
 
