@@ -17,6 +17,8 @@ from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.rollout import Rollout
 
+CHUNK = 1024  # samples of a minibatch whose gradients are taken at a time: what a core's cache holds of a token policy
+
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
@@ -90,27 +92,32 @@ def update(
     sums: dict[str, Tensor] = {}
     steps = 0
     for _ in range(config.epochs):
-        for ids in torch.randperm(len(obs), generator=generator).split(config.minibatch):
-            value_loss = (critic(obs[ids]) - targets[ids]).pow(2).mean()
-            metrics: dict[str, Tensor] = {"value_loss": value_loss}
-            loss = value_loss
-            if train_actor:
-                judged = policy.assess(obs[ids], {name: x[ids] for name, x in taken.items()})
-                policy_loss = surrogate(judged.log_prob - taken["log_prob"][ids], advantages[ids], config.clip)
-                loss = loss + policy_loss + judged.loss
-                metrics |= {"policy_loss": policy_loss, "kl": judged.kl, **judged.metrics}
-            if not torch.isfinite(loss):
-                raise FloatingPointError(f"loss is {loss.item()}")
+        for minibatch in torch.randperm(len(obs), generator=generator).split(config.minibatch):
             optimizers.actor.zero_grad(set_to_none=True)
             optimizers.critic.zero_grad(set_to_none=True)
-            loss.backward()
+            means: dict[str, Tensor] = {}
+            for ids in minibatch.split(CHUNK):
+                value_loss = (critic(obs[ids]) - targets[ids]).pow(2).mean()
+                metrics: dict[str, Tensor] = {"value_loss": value_loss}
+                loss = value_loss
+                if train_actor:
+                    judged = policy.assess(obs[ids], {name: x[ids] for name, x in taken.items()})
+                    policy_loss = surrogate(judged.log_prob - taken["log_prob"][ids], advantages[ids], config.clip)
+                    loss = loss + policy_loss + judged.loss
+                    metrics |= {"policy_loss": policy_loss, "kl": judged.kl, **judged.metrics}
+                if not torch.isfinite(loss):
+                    raise FloatingPointError(f"loss is {loss.item()}")
+                share = len(ids) / len(minibatch)
+                (share * loss).backward()
+                for name, value in metrics.items():
+                    means[name] = means.get(name, torch.zeros(())) + share * value.detach()
             nn.utils.clip_grad_norm_(critic.parameters(), config.max_grad_norm)
             optimizers.critic.step()
             if train_actor:
                 nn.utils.clip_grad_norm_(optimizers.parameters, config.max_grad_norm)
                 optimizers.actor.step()
-                optimizers.adapt(float(metrics["kl"]), config.target_kl)
-            for name, value in metrics.items():
-                sums[name] = sums.get(name, torch.zeros(())) + value.detach()
+                optimizers.adapt(float(means["kl"]), config.target_kl)
+            for name, value in means.items():
+                sums[name] = sums.get(name, torch.zeros(())) + value
             steps += 1
     return {name: float(total) / steps for name, total in sums.items()} | {"lr": optimizers.lr}

@@ -119,6 +119,16 @@ def test_optimizers_resume():
     assert all(torch.equal(a, b) for a, b in zip(trial.actor.parameters(), other.actor.parameters(), strict=True))
 
 
+def test_a_minibatch_in_chunks_is_the_same_minibatch(monkeypatch):
+    whole, chunked = Trial(), Trial()
+    told = whole.learn()[1]
+    monkeypatch.setattr("kinetok.rl.ppo.CHUNK", 100)  # of 256: unequal chunks
+    again = chunked.learn()[1]
+    assert again == pytest.approx(told, rel=1e-3)
+    for a, b in zip(whole.actor.parameters(), chunked.actor.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
 def test_a_loss_that_is_not_finite_stops_before_any_step():
     trial = Trial(actor=Line(weight=float("inf")))
     before = copy.deepcopy(trial.actor.state_dict())

@@ -87,7 +87,7 @@ def test_paths_are_smooth_endless_and_within_their_limits(humanoid):
 def test_a_path_begins_below_the_root_as_it_moves(humanoid):
     qvel = np.zeros((5, humanoid.nv))
     qvel[:, 0] = [0.0, 1.0, 1.2, 9.0, 0.7]  # clipped to .6 .. 1.5 m/s
-    task = make(humanoid, 40, qvel=qvel, turn=1e-6, acceleration=1e-6)
+    task = make(humanoid, 40, qvel=qvel, speed=(0.6, 1.5), turn=1e-6, acceleration=1e-6)
     np.testing.assert_allclose(
         task.target[:, 0], task.world.free.drawn, atol=1e-6
     )  # the starts stand at x = 0, 1, 2 ..
