@@ -1,6 +1,7 @@
-"""Plot what a training logged: success and error of its evaluations over samples, one line per run.
+"""Plot what a training logged: its evaluations over samples, one panel a figure, one line a run.
 
 python benchmarks/curves.py runs/a/distill runs/b/distill --out docs/curves.png
+python benchmarks/curves.py cola=runs/cola lora=runs/lora --show eval/success_rate,eval/return --out target.png
 """
 
 import argparse
@@ -13,33 +14,46 @@ import matplotlib.pyplot as plt
 
 from kinetok.logger import read_metrics
 
+LABELS = {
+    "track/success": "success, share of episodes",
+    "track/mpjpe_mm": "MPJPE, mm",
+    "eval/success_rate": "targets reached, share",
+    "eval/final_distance_m": "final distance, m",
+    "eval/return": "return, 20 s",
+    "eval/velocity_error_mps": "velocity error, m/s",
+    "eval/heading_error_rad": "heading error, rad",
+    "eval/path_distance_m": "distance to the path, m",
+}
 
-def plot(runs: list[Path], out: Path) -> None:
-    """One panel for the share of episodes that succeed, one for MPJPE in mm."""
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7, 6), sharex=True)
+
+def plot(runs: list[str], shown: list[str], out: Path) -> None:
+    """runs: directories, or NAME=directory; shown: keys of metrics.jsonl."""
+    figure, panels = plt.subplots(len(shown), 1, figsize=(7, 3 * len(shown)), sharex=True, squeeze=False)
     for run in runs:
-        lines = [line for line in read_metrics(run / "metrics.jsonl") if "track/success" in line]
-        samples = [line["step"] / 1e6 for line in lines]
-        name = "/".join(run.parts[-3:])
-        upper.plot(samples, [100 * line["track/success"] for line in lines], label=name)
-        lower.plot(samples, [line["track/mpjpe_mm"] for line in lines], label=name)
-    upper.set_ylabel("success, % of episodes")
-    lower.set_ylabel("MPJPE, mm")
-    lower.set_xlabel("samples, millions")
-    for axes in (upper, lower):
+        name, _, place = run.rpartition("=")
+        lines = list(read_metrics(Path(place) / "metrics.jsonl"))
+        for axes, key in zip(panels[:, 0], shown, strict=True):
+            points = [(line["step"] / 1e6, line[key]) for line in lines if key in line]
+            if not points:
+                raise SystemExit(f"{place}/metrics.jsonl holds no {key}")
+            axes.plot(*zip(*points, strict=True), label=name or "/".join(Path(place).parts[-3:]))
+    for axes, key in zip(panels[:, 0], shown, strict=True):
+        axes.set_ylabel(LABELS.get(key, key))
         axes.grid(alpha=0.3)
         axes.set_ylim(bottom=0)
-    upper.legend(fontsize=7)
+    panels[-1, 0].set_xlabel("control steps, millions")
+    panels[0, 0].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(out, dpi=110)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="directories that hold a metrics.jsonl")
+    parser.add_argument("runs", nargs="+", help="directories that hold a metrics.jsonl, each with or without a NAME=")
+    parser.add_argument("--show", default="track/success,track/mpjpe_mm", help="what to plot, by its key in there")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     options = parser.parse_args()
-    plot(options.runs, options.out)
+    plot(options.runs, options.show.split(","), options.out)
 
 
 if __name__ == "__main__":
