@@ -113,10 +113,12 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
 @click.option("--turn", default=60.0, show_default=True, help="Degrees per second it turns at most, to either side.")
 @click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
 @click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
-@click.option("--into", default=None, type=PATHS, help="A gait to go over into and back, in step.")
+@click.option("--into", default=None, help="A gait to go over into and back, in step: a file, or `stand`.")
 @click.option("--count", default=1, show_default=True, help="Motions to make, of seeds that follow one another.")
 @option_seed
-def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into, count, seed) -> None:
+def clips_vary(
+    source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, count, seed
+) -> None:
     """Make long motions of a gait cycle: turning, hurrying, lingering, halting.
 
     \b
@@ -124,11 +126,14 @@ def clips_vary(source: Path, out: Path, name: str | None, seconds, turn, tempo, 
     there are, the nearer is always one that turns as asked.
     kinetok clips vary walk.txt --turn 80 --count 6 --out walk-varied.safetensors
     kinetok clips vary walk.txt --into jog.txt --out walk-jog.safetensors
+    kinetok clips vary walk.txt --into stand --out walk-stand.safetensors
     """
-    from kinetok.motion.vary import vary
+    from kinetok.motion.vary import standing, vary
 
     check_suffix(out, ".safetensors")
-    clip, other = one_clip(source, name), None if into is None else one_clip(into, None)
+    clip, other = one_clip(source, name), None
+    if into is not None:
+        other = standing(clip) if into == "stand" else one_clip(Path(into), None)
     told = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt, "into": other}
     varied = [vary(clip, seed=seed + number, **told) for number in range(count)]
     if count > 1:

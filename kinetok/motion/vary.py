@@ -2,6 +2,7 @@
 
     clip = vary(walk, seconds=60, turn=60, tempo=1.2, halt=6, seed=0)      # one long motion, no longer a loop
     clip = vary(walk, into=jog, seconds=60, turn=60)                       # from walking to jogging and back
+    clip = vary(walk, into=standing(walk), seconds=60, turn=60)            # to a stand and back, by smaller steps
 
 A recorded walk cycle goes one way at one speed; a prior that saw no other has nothing to choose from. Four changes
 keep a motion near to what a body can do, and physics does the rest when it is tracked:
@@ -11,7 +12,8 @@ keep a motion near to what a body can do, and physics does the rest when it is t
 - tempo    the motion plays faster and slower by a factor that wanders
 - halt     it comes to rest where both feet are on the floor and hardly move, stays a while, and goes on
 - into     its cycle is blended with another's, in step (Rose, Cohen, Bodenheimer 1998, "Verbs and adverbs"), by a share
-           that wanders: between a walk and a jog lie all the speeds that neither has
+           that wanders: between a walk and a jog lie all the speeds that neither has, between a walk and standing all
+           slower ones, in steps that grow as small, and turns that do
 
 Nothing here simulates: the result is a reference, to be tracked like any other. Where the feet stand, a bent path drags
 them along an arc; a simulated body does not follow that, and its tracking error is larger for it.
@@ -24,7 +26,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip, interpolate
-from kinetok.motion.kinematics import kinematics
+from kinetok.motion.kinematics import kinematics, lowest_point
 
 VARIED = "-varied"
 FPS = 60.0
@@ -71,6 +73,9 @@ def vary(
     if into is not None:
         share = (0.5 + DWELL * _wander(rng, steps, CHANGE)).clip(0, 1)
         qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
+        if not np.ptp(into.qpos[:, :2]):
+            bent = bent * (1 - share)  # who stands does not turn
+            qpos[:, 2] -= np.minimum(lowest_point(Character.load(clip.character), qpos), 0)  # knees in step bend less
         source = f"{clip.source} into {into.source}, {source}"
         return replace(clip, name=name, fps=FPS, qpos=_bend(qpos, bent * speed), loop=False, source=source)
     phase = _play(speed, _quiet(clip) if halt else np.empty(0), halt, rng, clip)
@@ -84,6 +89,13 @@ def vary(
         clip, name=clip.name + VARIED, fps=FPS, qpos=_bend(qpos, bent[: len(qpos)] * rate), loop=False,
         source=f"{clip.source}, {source}",
     )  # fmt: skip
+
+
+def standing(clip: Clip) -> Clip:
+    """The character's standing pose for a cycle of `clip`, facing as it does: a gait of no way to go over into."""
+    qpos = np.tile(Character.load(clip.character).stand(), (2, 1))
+    qpos[:, 3:7] = rotation.about_z(np.repeat(rotation.heading(clip.qpos[:1, 3:7]), 2))
+    return replace(clip, name="stand", fps=1 / clip.seconds, qpos=qpos, loop=True, source="the standing pose")
 
 
 def _wander(rng: np.random.Generator, steps: int, seconds: float = WANDER) -> np.ndarray:

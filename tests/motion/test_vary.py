@@ -6,7 +6,7 @@ import pytest
 from kinetok import rotation
 from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import kinematics, lowest_point
-from kinetok.motion.vary import FPS, vary
+from kinetok.motion.vary import FPS, standing, vary
 
 
 def glide(humanoid, **fields) -> Clip:
@@ -43,6 +43,16 @@ def test_the_tempo_stays_within_its_factor(humanoid):
     varied = vary(glide(humanoid), seconds=30, turn=0, tempo=1.5)
     speed = np.diff(varied.qpos[:, 0]) * FPS
     assert 1 / 1.5 - 1e-6 < speed.min() < 0.8 and 1.25 < speed.max() < 1.5 + 1e-6
+
+
+def test_a_walk_goes_over_into_standing_without_turning_there(walk, humanoid):
+    varied = vary(walk, seconds=60, turn=70, into=standing(walk))
+    speed = np.linalg.norm(np.diff(varied.qpos[:, :2], axis=0), axis=1) * FPS
+    assert 0.05 < (speed < 0.01).mean() < 0.6 and speed.max() > 0.9
+    turn = np.abs(np.diff(np.unwrap(rotation.heading(varied.qpos[:, 3:7])))) * FPS
+    assert turn[speed < 0.01].max() < 0.1 and turn[speed > 0.9].max() > 0.4
+    low = lowest_point(humanoid, varied.qpos)
+    assert low.min() > -1e-3 and low.max() < 0.03
 
 
 def test_a_walk_halts_with_both_feet_on_the_floor(walk, humanoid):
