@@ -309,3 +309,25 @@ def test_recorded_files(data_dir, file):
             moved.xpos[:, body.body_names.index(f"{side}_{part}")] for part in ("thigh", "shin", "foot")
         )
         assert ((knee - (hip + ankle) / 2) * ahead).sum(-1).min() > -0.06
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "bvh/cmu_motionbuilder/cmu_12_01_walk.bvh",
+        "bvh/pymo/AV_8Walk_Meredith_HVHA_Rep1.bvh",
+        "train/amp_npy/amp_humanoid_walk.npy",
+    ],
+)
+def test_a_foot_that_stands_is_level_on_whatever_floor_was_recorded(data_dir, file):
+    (recorded,) = read(data_dir / file)
+    motion, _ = mend(recorded)
+    assert isinstance(motion, SkeletonMotion)
+    body = Character.load("humanoid")
+    clip = retarget(motion, "humanoid").clip
+    moved = kinematics(body, clip.qpos, clip.fps)
+    for foot in body.bodies("feet"):
+        ahead = rotation.rotate(moved.xquat[:, foot], np.array([1.0, 0.0, 0.0]))
+        standing = np.linalg.norm(moved.linear[:, foot], axis=-1) < 0.1
+        pitch = np.degrees(np.arcsin(-ahead[standing, 2]))
+        assert standing.sum() >= 10 and np.percentile(np.abs(pitch), 75) < 5, (file, pitch.round())

@@ -30,7 +30,8 @@ UPRIGHT = 0.87  # cosine of 30 degrees: a zero pose that deviates more does not 
 SNAP = 0.94  # cosine of 20 degrees: zero poses are built along the axes
 BENT = (np.deg2rad(10), np.deg2rad(30))  # below the first the flexion axis is the bone's, above the second the bend's
 SLOW, SHORTEST = 0.5, 0.07  # m/s, s: a foot that stands
-NEAR, LOW = 0.06, 0.03  # of the leg's length: height of a joint that stands, of the ankle of a level foot
+STILL = 0.15  # m/s: the ankle of a level foot, which at push-off it rises faster than
+NEAR, LOW = 0.06, 0.03  # of the leg's length: height of a joint that stands, of the ankle of a level foot that moves
 TIP = np.array([0.17, 0.0, -0.07])  # of the leg's length: toes seen from the ankle
 TILT = np.deg2rad(15)  # of a level foot
 ANKLE = 1.3  # rad: a foot turned farther from its place below the shin was recorded wrong
@@ -211,9 +212,9 @@ def contacts(
     for kind, points in (("ankle", {side: places[f"{side}_foot"] for side in SIDES}), ("toe", tips)):
         floor = np.percentile(np.concatenate([points[side][:, 2] for side in SIDES]), 3)
         for side in SIDES:
-            rise, slow = points[side][:, 2] - floor, speed(points[side], fps) < SLOW
-            down[side, kind] = slow & (rise < NEAR * size)
-            down[side, kind, "low"] = slow & (rise < LOW * size)
+            rise, pace = points[side][:, 2] - floor, speed(points[side], fps)
+            down[side, kind] = (pace < SLOW) & (rise < NEAR * size)
+            down[side, kind, "low"] = down[side, kind] & ((rise < LOW * size) | (pace < STILL))
     shortest = max(2, round(SHORTEST * fps))
     contact = {side: _settle(down[side, "ankle"] | down[side, "toe"], shortest) for side in SIDES}
     level = {side: _settle(down[side, "ankle", "low"] & down[side, "toe"], shortest) & contact[side] for side in SIDES}

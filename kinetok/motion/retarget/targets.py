@@ -161,13 +161,23 @@ def _ground(actor: Actor, ankles: dict[str, np.ndarray], soles: dict[str, np.nda
 
 def tiptoe(feet: np.ndarray, figure: Figure, side: str, height: np.ndarray, actor: Actor) -> np.ndarray:
     """Frames (T, 3, 3) of a foot, toes down by up to TIPTOE where it stands on them and would not reach the floor from
-    an ankle at `height` (T,): a character's foot has no toe joint and is shorter than the actor's."""
+    an ankle at `height` (T,): a character's foot has no toe joint and is shorter than the actor's.
+
+    In a stance that is level at times, heights count from those of its level frames, for recorded floors are not even,
+    and toes go down after the first of them alone: before it, the heel comes down.
+    """
     angles = np.linspace(0, TIPTOE, 15)
     turns = rotation.to_matrix(rotation.from_rotvec(np.outer(angles, [0.0, 1, 0])))
     floors = np.stack([-_soles(feet @ turn, figure, side)[..., 2].min(1) for turn in turns], axis=1)
+    level, height = actor.level[side], height.copy()
+    standing = actor.contact[side] & ~level
+    for start, stop in stretches(actor.contact[side]):
+        flat = start + np.flatnonzero(level[start:stop])
+        if len(flat):
+            height[start:stop] -= np.median(height[flat] - floors[flat, 0])
+            standing[start : flat[0]] = False
     short = np.maximum.accumulate(floors, axis=1) < height[:, None]
     angle = angles[np.minimum(short.sum(1), len(angles) - 1)]
-    standing = actor.contact[side] & ~actor.level[side]
     angle = _spread((angle * standing)[:, None], stretches(standing), LEVELLING * actor.fps)
     return feet @ rotation.to_matrix(rotation.from_rotvec(angle * [0.0, 1, 0]))
 
