@@ -150,7 +150,7 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """Demonstrations in a quarter of an hour, two million control steps of reward: docs/tutorial.md."""
+    """Demonstrations in a quarter of an hour, three million control steps of reward: docs/tutorial.md."""
     return FinetuneConfig()
 
 

@@ -61,9 +61,9 @@ class FinetuneConfig:
     sft: SFTConfig = SFTConfig()
     hindsight: HindsightConfig = HindsightConfig()
     policy: TokenPolicyConfig = TokenPolicyConfig()
-    samples: int = 2_000_000
+    samples: int = 3_000_000
     rows: int = 512
-    eval_every: int = 100_000
+    eval_every: int = 200_000
     eval_episodes: int = 64
     eval_seconds: float = 20.0
     critic: tuple[int, ...] = (256, 128)
