@@ -1,6 +1,6 @@
 """A task without a prior: PPO over PD targets from nothing, in the worlds a fine-tuned skill is trained in.
 
-    python benchmarks/scratch.py target --samples 2000000 --out scratch.json
+    python benchmarks/scratch.py target --samples 3000000 --out scratch.json
 
 The policy is a network from state and task to joint angles, with Gaussian noise, that knows neither clips nor tokens;
 worlds, starts, rewards, evaluation and PPO are those of `kinetok finetune`. The figures are those of
@@ -96,7 +96,7 @@ def scratch(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=list(TASKS))
-    parser.add_argument("--samples", type=int, default=2_000_000)
+    parser.add_argument("--samples", type=int, default=3_000_000)
     parser.add_argument("--run", type=Path, default=Path("runs/scratch"), help="run directory; an old one goes on")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--seed", type=int, default=0)
