@@ -13,6 +13,7 @@ simulation has not blown up. A character that crawls or lies by intent does not 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,26 +170,31 @@ def evaluate_task(
     episodes: int = 256,
     seconds: float = 20.0,
     push: float = 0.0,
+    top_p: float | None = None,
+    temperature: float | None = None,
     seed: int = 0,
     threads: int = 0,
 ) -> dict[str, Any]:
     """Scores of a skill, or of a prior alone where adapter is None, on a task (sim.tasks; the skill's own if None).
 
     A Scorecard's measures: rewards, survival, and what the task defines, such as success_rate and final_distance_m,
-    None where it never happened. push: m/s at the root, every two seconds.
+    None where it never happened. push: m/s at the root, every two seconds. top_p, temperature: of the tokens, by
+    default the skill's own, or 0.9 and 1.
     """
+    drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
     if task is not None:
         pick(TASKS, task, "task")
     if adapter is not None:
         skill = Skill.from_pretrained(adapter, prior, tokenizer)
+        skill = replace(skill, policy=replace(skill.policy, **drawn))
         config, model, controller = skill.task, skill.prior, skill.controller(seed)
         if task not in (None, config.kind):
             raise ConfigError(f"{adapter} was bent to {config.kind!r} and cannot read what {task!r} asks")
     else:
         model, config = Prior.from_pretrained(prior or "humanoid-gpt", tokenizer), TASKS[task or "target"][0]()
-        controller = _blind(PriorController(model, generator=torch.Generator().manual_seed(seed)))
+        controller = _blind(PriorController(model, generator=torch.Generator().manual_seed(seed), **drawn))
     played = play(controller, config, model, episodes=episodes, seconds=seconds, push=push, seed=seed, threads=threads)
-    return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed}
+    return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed} | drawn
 
 
 def _blind(alone: PriorController) -> Controller:

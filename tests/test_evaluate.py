@@ -167,6 +167,15 @@ def test_the_prior_alone_does_what_a_skill_does_that_has_learned_nothing(steerin
     assert target["task"] == "target" and target["success_rate"] is None and target["final_distance_m"] is None
 
 
+def test_how_tokens_are_drawn_may_be_changed(steering):
+    skill, prior = steering
+    options = {"episodes": 2, "seconds": 0.5, "seed": 3, "threads": 1}
+    usual, own = evaluate_task(skill, **options), evaluate_task(skill, top_p=0.9, temperature=1.0, **options)
+    assert own == usual | {"top_p": 0.9, "temperature": 1.0}
+    assert evaluate_task(skill, temperature=0.5, **options)["return"] != usual["return"]
+    assert evaluate_task(None, prior, top_p=0.3, **options)["return"] != evaluate_task(None, prior, **options)["return"]
+
+
 def test_what_cannot_be_evaluated(steering, tmp_path):
     skill, prior = steering
     with pytest.raises(ConfigError, match="was bent to 'steering' and cannot read what 'path' asks"):

@@ -57,11 +57,18 @@ def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, thread
 @click.option("--episodes", default=256, show_default=True, help="Characters, each for --seconds.")
 @click.option("--seconds", default=20.0, show_default=True, help="Length of each; a target comes every 6 to 8 s.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@click.option(
+    "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: the skill's own; alone: 0.9]"
+)
+@click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
 @option_threads
 @option_seed
-def evaluate_task(adapter, prior, tokenizer, task, out, episodes, seconds, push, threads, seed) -> None:
+def evaluate_task(
+    adapter, prior, tokenizer, task, out, episodes, seconds, push, top_p, temperature, threads, seed
+) -> None:
     """How well a skill does its task: success, final distance, errors, return and survival, as the task defines."""
     from kinetok.evaluate import evaluate_task as score
 
     told = {"episodes": episodes, "seconds": seconds, "push": push, "threads": threads, "seed": seed}
+    told |= {"top_p": top_p, "temperature": temperature}
     show_json(score(adapter, prior, task, tokenizer=tokenizer, **told), out)
