@@ -153,6 +153,7 @@ def test_a_task_is_measured_the_same_at_any_thread_count_and_by_its_seed(steerin
     assert {"return", "survival_rate", "velocity_error_mps", "heading_error_rad"} <= one.keys()
     assert (one["task"], one["seed"], one["episodes"], one["push_mps"]) == ("steering", 1, 3, 0.5)
     assert "success_rate" not in one  # steering defines none
+    assert 1.0 < one["head_height_m"] < 1.6
     json.dumps(one, allow_nan=False)
 
 

@@ -132,8 +132,8 @@ class TaskScore:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Played:
-    """score; qpos (T, K, nq) of the first K = `record` rows, and markers (T lists) of the first row, in frames of
-    `fps`."""
+    """score, with head_height_m (mean, of the head's joint) where the character names its head; qpos (T, K, nq) of the
+    first K = `record` rows, and markers (T lists) of the first row, in frames of `fps`."""
 
     score: TaskScore
     qpos: np.ndarray
@@ -185,6 +185,7 @@ def play(
     )
     env = Env(world, task, rows=episodes, threads=threads, seed=seed)
     card = Scorecard(rows=episodes, control_hz=prior.fps)
+    heads = prior.character.bodies("head") if "head" in prior.character.roles else []
     obs = env.reset()
     qpos: list[np.ndarray] = []
     markers: list[list[Marker]] = []
@@ -194,7 +195,9 @@ def play(
                 qpos.append(env.sim.qpos[:record].copy())
                 markers.append(task.markers(0))
             step = env.step(controller(torch.from_numpy(obs)).numpy())
-            card.add(step.reward, step.terminated, task.measure(env.sim.state()))
+            body = env.sim.state()
+            head = {"head_height_m": body.pos[:, heads[0], 2]} if heads else {}
+            card.add(step.reward, step.terminated, task.measure(body) | head)
             obs = step.obs
     frames = np.stack(qpos) if qpos else np.empty((0, 0, prior.character.nq))
     return Played(score=TaskScore(measures=card.summary()), qpos=frames, markers=markers, fps=prior.fps)
