@@ -9,7 +9,7 @@ ever: arcs of half a second, each with its own turn rate, between which heading 
 silent on its paths; the speeds here are those of the recorded walks.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,13 +22,15 @@ from kinetok.sim.tasks.marker import AHEAD, GOAL, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
 
 CATCH_UP = 2.0  # seconds in which a demonstration returns to the path
+JUMP = 1.0  # metres
 
 
 @dataclass(frozen=True, kw_only=True)
 class PathConfig:
     """scale: alpha_traj per metre (GPC table 11); waypoints, seconds: how many, up to how far ahead (app. D.1).
     speed: range along the path, m/s; acceleration: largest, m/s^2; turn: largest turn rate, rad/s; far: metres from
-    the path at which an episode fails, 0 for never; fall_height: as in TargetConfig (ours)."""
+    the path at which an episode fails, 0 for never; jumps: range of seconds after which the whole path is shifted by up
+    to a metre, none by default; fall_height: as in TargetConfig (ours)."""
 
     kind: Literal["path"] = "path"
     scale: float = 2.0
@@ -38,16 +40,17 @@ class PathConfig:
     acceleration: float = 0.5
     turn: float = 0.6
     far: float = 0.0
+    jumps: tuple[float, float] | None = None
     fall_height: float = 0.5
 
     def __post_init__(self) -> None:
-        check_ranges(speed=self.speed)
+        check_ranges(speed=self.speed, **({} if self.jumps is None else {"jumps": self.jumps}))
         if self.waypoints < 1 or min(self.seconds, self.acceleration, self.turn, self.far) < 0:
             raise ConfigError(f"a path has waypoints and no negative settings: {self}")
 
     def restless(self, seconds: tuple[float, float]) -> "PathConfig":
-        """The same task: its arcs already change every half second."""
-        return self
+        """The same task on a path that jumps: a smooth one says little that the motion so far does not."""
+        return replace(self, jumps=seconds)
 
 
 class Path:
@@ -77,6 +80,7 @@ class Path:
         self.now = 0
         self.points = np.zeros((rows, (config.waypoints + 1) * self.arc, 2), dtype=np.float32)
         self.angle, self.speed = np.zeros(rows, dtype=np.float32), np.zeros(rows, dtype=np.float32)  # at the last point
+        self.left = np.zeros(rows, dtype=int)  # control steps until the path jumps
 
     @property
     def target(self) -> np.ndarray:
@@ -90,6 +94,7 @@ class Path:
         self.speed[ids] = np.hypot(qvel[:, 0], qvel[:, 1]).clip(*self.config.speed)
         self.points[ids, : self.now + 1] = qpos[:, None, :2]
         self._extend(ids, self.now + 1)
+        self._wait(ids)
         return qpos, qvel
 
     def advance(self) -> None:
@@ -99,6 +104,13 @@ class Path:
             self.now = 0
             self.points[:, : -self.arc] = self.points[:, self.arc :].copy()
             self._extend(np.arange(len(self.points)), self.points.shape[1] - self.arc)
+        if self.config.jumps is not None:
+            self.left -= 1
+            due = np.flatnonzero(self.left <= 0)
+            if len(due):
+                way = JUMP * self.world.rng.random(len(due)) ** 0.5
+                self.points[due] += (way[:, None] * direction(self.world.rng.uniform(-np.pi, np.pi, len(due))))[:, None]
+                self._wait(due)
 
     def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
         """state | task (n, O) float32 of all rows or of rows ids."""
@@ -162,6 +174,10 @@ class Path:
 
     def load_state_dict(self, state: dict) -> None:
         self.now = state["now"]
+
+    def _wait(self, ids: np.ndarray) -> None:
+        if self.config.jumps is not None:
+            self.left[ids] = (self.world.rng.uniform(*self.config.jumps, len(ids)) * self.control_hz).round()
 
     def _extend(self, ids: np.ndarray, first: int) -> None:
         """Let the paths of rows ids go on from point first - 1, at their `angle` and `speed`, to the last point."""

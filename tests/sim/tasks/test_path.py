@@ -117,3 +117,19 @@ def test_paths_that_cannot_be_are_refused(humanoid):
         PathConfig(waypoints=0)
     with pytest.raises(ConfigError, match=r"400 waypoints in 5.0 s are closer than 1/30 s"):
         make(humanoid, 1, waypoints=400)
+
+
+def test_a_restless_path_jumps_and_goes_on_as_it_was(humanoid):
+    task = make(humanoid, 200)
+    task.config = task.config.restless((0.4, 4.0))
+    task.start(np.arange(200), np.random.default_rng(0))
+    moved = []
+    for _ in range(120):
+        before, now = task.points.copy(), task.now
+        task.advance()
+        shift = task.points - before if task.now == now + 1 else task.points[:, : -task.arc] - before[:, task.arc :]
+        np.testing.assert_allclose(shift, np.broadcast_to(shift[:, :1], shift.shape), atol=1e-5)  # all of it, or none
+        moved.append(np.linalg.norm(shift[:, 0], axis=-1))
+    jumped = np.array(moved) > 1e-4
+    assert 0.9 < np.max(moved) <= 1.0 + 1e-5 and not jumped[:11].any()
+    assert 0.8 * 120 / 66 < jumped.sum(0).mean() < 1.2 * 120 / 66  # every 2.2 s on average
