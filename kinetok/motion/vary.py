@@ -73,11 +73,12 @@ def vary(
     if into is not None:
         share = (0.5 + DWELL * _wander(rng, steps, CHANGE)).clip(0, 1)
         qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
-        if not np.ptp(into.qpos[:, :2]):
-            bent = bent * (1 - share)  # who stands does not turn
+        stands = not np.ptp(into.qpos[:, :2])
+        qpos = _bend(qpos, bent * speed * (1 - share if stands else 1))  # who stands does not turn
+        if stands:
             qpos[:, 2] -= np.minimum(lowest_point(Character.load(clip.character), qpos), 0)  # knees in step bend less
         source = f"{clip.source} into {into.source}, {source}"
-        return replace(clip, name=name, fps=FPS, qpos=_bend(qpos, bent * speed), loop=False, source=source)
+        return replace(clip, name=name, fps=FPS, qpos=qpos, loop=False, source=source)
     phase = _play(speed, _quiet(clip) if halt else np.empty(0), halt, rng, clip)
     if not clip.loop:
         phase = phase[: np.searchsorted(phase, clip.seconds)]
