@@ -68,14 +68,15 @@ def evaluate_tracking(
         threads=threads,
         seed=seed,
     )
-    columns = score.success, score.success_mean_error, score.mpjpe_mm, score.seconds
+    columns = score.success, score.success_mean_error, score.survival, score.mpjpe_mm, score.seconds
     return {
         "success_rate": float(score.success.mean()),
         "success_rate_mean_error": float(score.success_mean_error.mean()),
+        "survival_rate": float(score.survival.mean()),
         "mpjpe_mm": float(score.mpjpe_mm.mean()),
         "clips": [
-            {"name": name, "success": s, "success_mean_error": m, "mpjpe_mm": e, "seconds": t}
-            for name, s, m, e, t in zip(score.names, *(column.tolist() for column in columns), strict=True)
+            {"name": name, "success": s, "success_mean_error": m, "survival": a, "mpjpe_mm": e, "seconds": t}
+            for name, s, m, a, e, t in zip(score.names, *(column.tolist() for column in columns), strict=True)
         ],
         "utilisation": None,
         "perplexity": None,
@@ -181,7 +182,9 @@ def evaluate_task(
     None where it never happened. push: m/s at the root, every two seconds. top_p, temperature: of the tokens, by
     default the skill's own, or 0.9 and 1.
     """
-    drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
+    drawn: dict[str, Any] = {
+        name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None
+    }
     if task is not None:
         pick(TASKS, task, "task")
     if adapter is not None:

@@ -4,8 +4,9 @@
     score.success.mean(), score.mpjpe_mm.mean()
 
 An episode of a loop runs `seconds`, from phases spread evenly over the cycle; an episode of any other clip runs from
-its first frame to its end. Start poses are disturbed by 0.01 rad, so that episodes differ. An episode ends early when
-the mean body error exceeds 0.5 m, or is not a number in a blown-up simulation.
+its first frame to its end. Start poses are disturbed by 0.01 rad, so that episodes differ. An episode has failed when
+the mean body error exceeds 0.5 m, or is not a number in a blown-up simulation, and then ends early. Under pushes it
+goes on until it falls as well: who was pushed away and walks on has lost its place, not its balance.
 """
 
 from dataclasses import dataclass
@@ -20,18 +21,20 @@ from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 
 THRESHOLD = 0.5
+FALL = 0.4  # metres of the root's height from its reference's
 START_NOISE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingScore:
     """Per clip (K,): success, the share of episodes whose largest body error stayed below 0.5 m; success_mean_error,
-    the same of the mean body error; mpjpe_mm over all frames of all episodes; seconds survived (mean form); limit:
-    seconds that its episodes could last."""
+    the same of the mean body error; survival, the share that never fell, without pushes the same; mpjpe_mm over
+    all frames until a failure; seconds until it (mean form); limit: seconds that its episodes could last."""
 
     names: tuple[str, ...]
     success: np.ndarray
     success_mean_error: np.ndarray
+    survival: np.ndarray
     mpjpe_mm: np.ndarray
     seconds: np.ndarray
     limit: np.ndarray
@@ -58,7 +61,8 @@ class TrackingScore:
     @staticmethod
     def from_json(data: dict) -> "TrackingScore":
         """Scores from before limits were kept take the longest clip's seconds for every clip's, as they did then."""
-        data = {"limit": [max(data["seconds"])] * len(data["seconds"])} | data
+        longest = [max(data["seconds"])] * len(data["seconds"])
+        data = {"limit": longest, "survival": data["success_mean_error"]} | data
         arrays = {key: np.array(value) for key, value in data.items() if key not in ("names", "episodes")}
         return TrackingScore(names=tuple(data["names"]), episodes=data["episodes"], **arrays)
 
@@ -83,7 +87,7 @@ def track(
     loops = table.last - table.first > table.cycle
     starts = (share * np.where(loops, table.cycle, 0)[fixed]).astype(int)
     rows = len(fixed)
-    config = TrackingConfig(future=future, fail_max=np.inf, fail_mean=THRESHOLD)
+    config = TrackingConfig(future=future, fail_max=np.inf, fail_mean=np.inf)
     task = Tracking(config, table, rows=rows, fixed=fixed, starts=starts)
     env_config = EnvConfig(
         scene=scene or SceneConfig(),
@@ -92,23 +96,27 @@ def track(
         push=push,
         push_seconds=push_seconds,
         push_regular=True,
+        autoreset=False,
     )
     env = Env(env_config, task, rows=rows, threads=threads, seed=seed)
     left = (table.last - table.first)[fixed] - starts
     limit = np.where(loops[fixed], np.minimum(round(seconds * table.control_hz), left), left)
-    running, failed = np.ones(rows, bool), np.zeros(rows, bool)
-    largest, total, frames = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+    running, failed, fallen = np.ones(rows, bool), np.zeros(rows, bool), np.zeros(rows, bool)
+    largest, total, frames, steps = np.zeros(rows), np.zeros(rows), np.zeros(rows), 0
     obs = env.reset()
     with torch.no_grad(), torch_threads(1):
         while running.any():
             step = env.step(actor.act(torch.from_numpy(obs))[0].numpy())
-            obs = step.obs
-            error = np.nan_to_num(task.error[running], nan=np.inf, posinf=np.inf)
-            largest[running] = np.maximum(largest[running], error.max(1))
-            total[running] += np.minimum(error.mean(1), 1.0)
-            frames[running] += 1
-            failed |= running & step.terminated
-            running &= ~(step.terminated | step.truncated) & (frames < limit)
+            obs, steps = step.obs, steps + 1
+            counts = running & ~failed
+            error = np.nan_to_num(task.error[counts], nan=np.inf, posinf=np.inf)
+            largest[counts] = np.maximum(largest[counts], error.max(1))
+            total[counts] += np.minimum(error.mean(1), 1.0)
+            frames[counts] += 1
+            failed[counts] = step.terminated[counts] | (error.mean(1) > THRESHOLD)
+            height = np.abs(env.sim.qpos[:, 2] - task.reference.pos[:, 0, 2])
+            fallen |= running & (step.terminated | (height > FALL) if push else failed)
+            running &= ~(fallen | step.truncated) & (steps < limit)
 
     def per_clip(values: np.ndarray) -> np.ndarray:
         return values.reshape(clips, episodes).mean(1)
@@ -117,6 +125,7 @@ def track(
         names=table.names,
         success=per_clip(~failed & (largest < THRESHOLD)),
         success_mean_error=per_clip(~failed),
+        survival=per_clip(~fallen),
         mpjpe_mm=1000 * total.reshape(clips, episodes).sum(1) / frames.reshape(clips, episodes).sum(1),
         seconds=per_clip(frames) / table.control_hz,
         limit=per_clip(limit) / table.control_hz,

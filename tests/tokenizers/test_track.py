@@ -77,6 +77,16 @@ def test_pushes_are_felt_and_seeded(standing, good):
     assert once.to_json() == twice.to_json() != other.to_json()
 
 
+def test_who_loses_its_place_has_failed_but_not_fallen(wave):
+    """The reference jumps away by 2 m: the body stands on, unless it goes limp."""
+    clip = wave("jump", 1.0)
+    clip.qpos[10:, 0] += 2.0
+    table = ReferenceTable(ClipLibrary.of([clip]))
+    stands, limp = (track(Follow(28, offset), table, future=(1,), push=0.01, episodes=2) for offset in (0.0, 1.5))
+    assert stands.success_mean_error[0] == limp.success_mean_error[0] == 0 and stands.seconds[0] == pytest.approx(1 / 3)
+    assert stands.survival[0] == 1 and limp.survival[0] == 0
+
+
 def test_a_clip_survives_relative_to_how_long_it_could_last(good):
     """Halving what the short of two clips survives costs as much as halving the long one's: 0.2 * 0.5 / 2."""
     both = replace(good, seconds=np.array([1.0, 20.0]), limit=np.array([1.0, 20.0]))
@@ -94,8 +104,9 @@ def test_the_limit_is_the_clips_end_or_the_seconds_of_a_loop(wave, good):
 
 def test_a_score_from_before_limits_keeps_its_merit(good):
     old = good.to_json() | {"seconds": [0.5, 2.0]}
-    del old["limit"]
+    del old["limit"], old["survival"]
     again = TrackingScore.from_json(old)
+    assert again.survival.tolist() == good.success_mean_error.tolist()
     expected = good.success.mean() + 0.2 * (0.25 + 1) / 2 - good.mpjpe_mm.mean() / 1000
     assert again.limit.tolist() == [2.0, 2.0] and again.merit == pytest.approx(expected)
 
@@ -103,6 +114,6 @@ def test_a_score_from_before_limits_keeps_its_merit(good):
 def test_json_round_trip_is_exact(good):
     again = TrackingScore.from_json(json.loads(json.dumps(good.to_json())))
     assert again.names == good.names and again.episodes == good.episodes
-    for name in ("success", "success_mean_error", "mpjpe_mm", "seconds", "limit"):
+    for name in ("success", "success_mean_error", "survival", "mpjpe_mm", "seconds", "limit"):
         assert np.array_equal(getattr(again, name), getattr(good, name))
     assert again.merit == good.merit

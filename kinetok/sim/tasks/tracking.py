@@ -9,7 +9,7 @@ parts a policy reads is the policy's choice: a tokenizer's encoder reads the win
 teacher may read all. Clips are tabulated once at the control rate, loops unrolled to the longest episode.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,10 +25,12 @@ from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingConfig:
-    """future: reference frames seen, in control steps ahead (GPC: 1, 2, 5, 7, 12, 18, 25); fail_max, fail_mean:
-    an episode fails when the largest or the mean body error exceeds so many metres."""
+    """future: reference frames seen, in control steps ahead (GPC: 1, 2, 5, 7, 12, 18, 25); leash: metres from the root
+    at which a reference that is further away is shown (ours): a push or a lag then looks like none a tracker has not
+    met; fail_max, fail_mean: an episode fails when the largest or the mean body error exceeds so many metres."""
 
     future: tuple[int, ...] = (1, 2, 5, 7, 12, 18, 25)
+    leash: float = 0.3
     fail_max: float = 0.5
     fail_mean: float = 0.3
     reward: TrackingReward = TrackingReward()
@@ -136,13 +138,25 @@ class Tracking:
         if ids is not None:
             frame, last, reference = frame[ids], last[ids], reference.rows(ids)
         ahead = np.minimum(frame[:, None] + self._future, last[:, None])
+        root, reference = self._leashed(body, table.root[ahead], reference)
         obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
         part = {name: obs[:, columns] for name, columns in self.layout.items()}
         observe.state_features(body, part["state"])
-        observe.window_features(body, table.pose[ahead], table.root[ahead], table.heading[ahead], part["window"])
+        observe.window_features(body, table.pose[ahead], root, table.heading[ahead], part["window"])
         observe.error_features(body, reference, part["error"])
         part["target"][:] = table.target[np.minimum(frame + 1, last)]
         return obs
+
+    def _leashed(self, body: BodyState, root: np.ndarray, reference: BodyState) -> tuple[np.ndarray, BodyState]:
+        """Future roots (n, F, 3) and the reference, brought nearer by as much as it is beyond the leash."""
+        away = reference.pos[:, 0, :2] - body.pos[:, 0, :2]
+        distance = np.sqrt(np.einsum("ni,ni->n", away, away))
+        far = np.flatnonzero(distance > self.config.leash)
+        if not len(far):
+            return root, reference
+        beyond = np.zeros((len(away), 1, 3), dtype=np.float32)
+        beyond[far, 0, :2] = away[far] * (1 - self.config.leash / distance[far, None])
+        return root - beyond, replace(reference, pos=reference.pos - beyond)
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """GPC eq. 8 against the frame the row should have reached."""

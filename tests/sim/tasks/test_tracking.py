@@ -1,5 +1,7 @@
 """tracking.py: the table, what a row on the reference sees, where episodes start and end."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,20 @@ def test_a_row_on_the_reference(table):
     reward, terms = task.reward(on_reference(table, task))
     np.testing.assert_allclose(reward, 1.2, atol=1e-5)
     np.testing.assert_allclose(sum(terms.values()), reward)
+
+
+def test_a_reference_beyond_the_leash_is_shown_at_its_end(table):
+    """Three rows pushed to the left of their reference, by less than the leash, by more, and by far more."""
+    task = begin(table, [0, 0, 0], [7, 7, 7])
+    pushed = on_reference(table, task)
+    pushed = replace(pushed, pos=pushed.pos + np.array([[0, 0.2, 0], [0, 0.31, 0], [0, 3, 0]], np.float32)[:, None])
+    obs = task.observe(pushed)
+    sideways = frames(task, obs)[:, :, -5]
+    heading = table.heading[task.frame[0]]
+    np.testing.assert_allclose(sideways[:, 0], -np.cos(heading) * np.array([0.2, 0.3, 0.3]), atol=1e-5)
+    np.testing.assert_allclose(obs[2], obs[1], atol=1e-5)  # how much further it is makes no difference
+    reward, _ = task.reward(pushed)
+    assert reward[1] > reward[2] and task.over(pushed)[0].tolist() == [False, True, True]  # 0.3 m on average is too far
 
 
 def test_the_window_holds_the_clips_end(table):
