@@ -25,7 +25,7 @@ from kinetok.sim.batch import BatchSim
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.observe import state_features
 from kinetok.sim.scene import build_scene
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.layout import TokenLayout
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 
@@ -84,7 +84,7 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
             f"{seconds:g} seconds of clip {clip.name!r} hold no control step of 1/{config.scene.control_hz} s"
         )
     table = ReferenceTable(ClipLibrary.of([clip]), control_hz=config.scene.control_hz, seconds=seconds + 1)
-    tracking = TrackingConfig(future=config.future, fail_max=np.inf, fail_mean=0.5)
+    tracking = TrackingConfig(future=config.future, failure=Failure(largest=np.inf, mean=0.5))
     task = Tracking(tracking, table, rows=1, starts=np.zeros(1, dtype=int))
     env = Env(EnvConfig(scene=config.scene, autoreset=False), task, rows=1, threads=1, seed=seed)
     obs = torch.from_numpy(env.reset())

@@ -17,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.config import ConfigError, at_least
+from kinetok.config import at_least
 from kinetok.logger import Logger
 from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.roaming import REACH, Roaming
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.symmetry import Mirror
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.track import TrackingScore, track
@@ -34,9 +34,10 @@ from kinetok.tokenizers.train import COUNTS, KINDS, identify, in_scene, refuse_o
 @dataclass(frozen=True, kw_only=True)
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
-    memory: labelled states kept; noise: radians added to the student's targets while it acts; focus: how many times as
-    often the clip that fails most may be drawn as the one that fails least; save_every: samples
-    between states to resume from, at the next evaluation (the memory starts anew there, so not too often);
+    memory: labelled states kept; noise: radians added to the student's targets while it acts; failure: when its
+    episodes end; focus: how many times as often the clip that fails most may be drawn as the one that fails least;
+    save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
+    often);
     transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
     reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
 
@@ -51,7 +52,7 @@ class DistillStage:
     lr: float = 1e-3
     lr_end: float = 1e-4
     noise: float = 0.02
-    fail_mean: float = 0.3
+    failure: Failure = Failure()
     focus: float = 10.0
     transitions: float = 0.0
     reach_at_end: float = REACH
@@ -69,8 +70,6 @@ class DistillStage:
         })  # fmt: skip
         at_least(self, self.rows, {"memory": "every step's states go there, one of each of the rows"})
         at_least(self, 0, dict.fromkeys(("noise", "lr", "lr_end"), "0 is none"))
-        if not self.fail_mean > 0:
-            raise ConfigError(f"fail_mean must be above 0, not {self.fail_mean}; its unit is metres of mean body error")
 
 
 def distill(
@@ -96,7 +95,7 @@ def distill(
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
     seen_by_any = {frame for one in (student, *teachers) for frame in one.config.future}
-    tracking = TrackingConfig(future=tuple(sorted(seen_by_any)), fail_mean=config.fail_mean)
+    tracking = TrackingConfig(future=tuple(sorted(seen_by_any)), failure=config.failure)
     task = Tracking(tracking, table, rows=config.rows)
     if config.transitions:
         rng, rate = np.random.default_rng([seed, 1]), config.transitions

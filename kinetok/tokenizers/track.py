@@ -18,7 +18,7 @@ from kinetok.rl.nets import Actor
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.scene import SceneConfig
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 
 THRESHOLD = 0.5
 FALL = 0.4  # metres of the root's height from its reference's
@@ -87,7 +87,7 @@ def track(
     loops = table.last - table.first > table.cycle
     starts = (share * np.where(loops, table.cycle, 0)[fixed]).astype(int)
     rows = len(fixed)
-    config = TrackingConfig(future=future, fail_max=np.inf, fail_mean=np.inf)
+    config = TrackingConfig(future=future, failure=Failure(largest=np.inf, mean=np.inf))
     task = Tracking(config, table, rows=rows, fixed=fixed, starts=starts)
     env_config = EnvConfig(
         scene=scene or SceneConfig(),

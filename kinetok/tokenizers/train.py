@@ -26,7 +26,7 @@ from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reward import TrackingReward
 from kinetok.sim.scene import SceneConfig
 from kinetok.sim.tasks.roaming import Arriving
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
 from kinetok.tokenizers.track import TrackingScore, track
 
@@ -44,9 +44,10 @@ class PPOStage:
     episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; patience: or when, with
     stop_success reached, the best score is so many evaluations old; critic_warmup: first
     iterations that leave the policy alone; log_std: spread of the actions at the first and the last iteration;
-    anchor: pull towards the policy it started from; fail_mean: training's termination, metres of mean body error;
-    arrivals: share of the episodes that begin in a state of another clip, within `reach` metres of roaming.likeness, so
-    that motions can go over into one another."""
+    anchor: pull towards the policy it started from; failure: when training's
+    episodes end; eval_push: evaluations push the root by so many m/s every two seconds; arrivals: share of the episodes
+    that begin in a state of another clip, within `reach` metres of roaming.likeness, so that motions can go over into
+    one another."""
 
     samples: int = 2_000_000
     rows: int = 512
@@ -59,7 +60,8 @@ class PPOStage:
     critic_warmup: int = 0
     log_std: tuple[float, float] = (-2.6, -2.9)
     anchor: float = 0.0
-    fail_mean: float = 0.3
+    failure: Failure = Failure()
+    eval_push: float = 0.0
     arrivals: float = 0.0
     reach: float = 0.4
     reward: TrackingReward = TrackingReward()
@@ -69,8 +71,6 @@ class PPOStage:
     def __post_init__(self) -> None:
         at_least(self, 1, COUNTS)
         at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
-        if not self.fail_mean > 0:
-            raise ConfigError(f"fail_mean must be above 0, not {self.fail_mean}; its unit is metres of mean body error")
         if not (0 <= self.arrivals <= 1 and self.reach > 0):
             raise ConfigError(f"arrivals is a share and reach above 0 m, not {self.arrivals} and {self.reach}")
 
@@ -97,7 +97,7 @@ def train_ppo(
     identity = identify(config, actor.config, table.names, seed) | ({"parents": parents} if parents else {})
     refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
-    tracking = TrackingConfig(future=future, fail_mean=config.fail_mean, reward=config.reward)
+    tracking = TrackingConfig(future=future, failure=config.failure, reward=config.reward)
     task = Tracking(tracking, table, rows=config.rows)
     if config.arrivals:
         origins = others or table
@@ -122,7 +122,8 @@ def train_ppo(
     )
 
     def evaluate() -> TrackingScore:
-        return track(actor, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
+        episodes, push = config.eval_episodes, config.eval_push
+        return track(actor, table, future=future, scene=scene, episodes=episodes, push=push, threads=threads)
 
     def spread(share: float) -> None:
         policy.log_std = config.log_std[0] + share * (config.log_std[1] - config.log_std[0])

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, Tracking, TrackingConfig
 
 ROWS = 6
 
 
 def make(table, rows=ROWS, seed=0, threads=1, fixed=None, starts=None, loose=False, **config) -> Env:
-    limits = {"fail_max": 1e9, "fail_mean": 1e9} if loose else {}
-    task = Tracking(TrackingConfig(future=(1, 3), **limits), table, rows=rows, fixed=fixed, starts=starts)
+    failure = Failure(largest=1e9, mean=1e9) if loose else Failure()
+    task = Tracking(TrackingConfig(future=(1, 3), failure=failure), table, rows=rows, fixed=fixed, starts=starts)
     return Env(EnvConfig(**config), task, rows=rows, threads=threads, seed=seed)
 
 

@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.gym import TrackingVectorEnv
-from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, Tracking, TrackingConfig
 
 ROWS = 4
 ROOT = Path(__file__).parents[2]
@@ -21,9 +21,9 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def worlds(table):
-    limits = {"fail_max": 1e9, "fail_mean": 1e9}
+    failure = Failure(largest=1e9, mean=1e9)
     fixed, starts = np.array([0, 1, 0, 1]), np.array([0, 13, 5, 10])
-    task = Tracking(TrackingConfig(future=(1,), **limits), table, rows=ROWS, fixed=fixed, starts=starts)
+    task = Tracking(TrackingConfig(future=(1,), failure=failure), table, rows=ROWS, fixed=fixed, starts=starts)
     return TrackingVectorEnv(Env(EnvConfig(), task, rows=ROWS, threads=1))
 
 

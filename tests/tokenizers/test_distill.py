@@ -11,7 +11,7 @@ from kinetok.config import ConfigError
 from kinetok.logger import read_metrics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers import distill as module
 from kinetok.tokenizers.distill import DistillStage, _View, distill
 from kinetok.tokenizers.fit import new_tokenizer
@@ -153,7 +153,9 @@ def test_a_changed_teacher_is_refused(config, student, teachers, standing, tmp_p
 
 def test_a_clip_that_always_fails_leaves_the_others_their_share(student, teachers, wave, config, tmp_path):
     """The reference of the second clip is 9 m away: every episode there fails, of the first few do."""
-    calm = replace(config, samples=40 * 32, eval_every=40 * 32, fail_mean=0.4, env=EnvConfig(episode_seconds=0.2))
+    calm = replace(
+        config, samples=40 * 32, eval_every=40 * 32, failure=Failure(mean=0.4), env=EnvConfig(episode_seconds=0.2)
+    )
     table = ReferenceTable(ClipLibrary.of([wave("wave"), wave("lost")]))
     table.body.pos[table.first[1] :] += 9.0
     distill(student, teachers, table, calm, tmp_path, quiet=True)
@@ -169,7 +171,6 @@ def test_a_clip_that_always_fails_leaves_the_others_their_share(student, teacher
         ({"memory": 255}, "memory must be at least 256, not 255"),
         ({"focus": 0.5}, "focus must be at least 1, not 0.5; 1 draws all clips alike"),
         ({"noise": -0.1}, "noise must be at least 0, not -0.1"),
-        ({"fail_mean": -1.0}, "fail_mean must be above 0, not -1.0"),
     ],
 )
 def test_a_stage_that_cannot_run_is_refused(change, message):

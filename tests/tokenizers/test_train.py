@@ -179,7 +179,6 @@ def test_parents_are_kept_and_a_state_made_from_others_is_refused(whole, config,
         ({"eval_every": 0}, "eval_every must be at least 1, not 0; give as many as samples"),
         ({"eval_episodes": 0}, "eval_episodes must be at least 1, not 0"),
         ({"critic_warmup": -1}, "critic_warmup must be at least 0, not -1; 0 is none"),
-        ({"fail_mean": 0.0}, "fail_mean must be above 0, not 0.0"),
     ],
 )
 def test_a_stage_that_cannot_run_is_refused(change, message):

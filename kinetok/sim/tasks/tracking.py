@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kinetok import rotation
+from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.motion.kinematics import kinematics
 from kinetok.motion.library import ClipLibrary
@@ -24,15 +25,34 @@ from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
 
 
 @dataclass(frozen=True, kw_only=True)
+class Failure:
+    """largest, mean: an episode fails when the largest or the mean body error exceeds so many metres; slack: metres on
+    the floor that the root may be away by without that counting as error (ours; without it a push ends an episode, with
+    it pushes teach to recover: docs/log.md)."""
+
+    largest: float = 0.5
+    mean: float = 0.3
+    slack: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("largest", "mean"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(
+                    f"{name} must be above 0, not {getattr(self, name)}; its unit is metres of body error"
+                )
+        if not self.slack >= 0:
+            raise ConfigError(f"slack is metres that the root may be away by, 0 for none; not {self.slack}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrackingConfig:
     """future: reference frames seen, in control steps ahead (GPC: 1, 2, 5, 7, 12, 18, 25); leash: metres from the root
     at which a reference that is further away is shown (ours): a push or a lag then looks like none a tracker has not
-    met; fail_max, fail_mean: an episode fails when the largest or the mean body error exceeds so many metres."""
+    met; failure; reward."""
 
     future: tuple[int, ...] = (1, 2, 5, 7, 12, 18, 25)
     leash: float = 0.3
-    fail_max: float = 0.5
-    fail_mean: float = 0.3
+    failure: Failure = Failure()
     reward: TrackingReward = TrackingReward()
 
 
@@ -168,9 +188,17 @@ class Tracking:
 
         `error` keeps every body's distance (N, B) in metres from the reference, as it was before any reset.
         """
-        offset = body.pos - self.reference.pos
-        self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
-        fine = (self.error.max(1) < self.config.fail_max) & (self.error.mean(1) < self.config.fail_mean)
+        offset = self.reference.pos - body.pos
+        error = self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
+        if self.config.failure.slack:
+            away = offset[:, 0, :2]
+            distance = np.sqrt(np.einsum("ni,ni->n", away, away))
+            near = offset.copy()
+            near[..., :2] -= (away * (np.minimum(distance, self.config.failure.slack) / distance.clip(1e-6))[:, None])[
+                :, None
+            ]
+            error = np.sqrt(np.einsum("nbi,nbi->nb", near, near))
+        fine = (error.max(1) < self.config.failure.largest) & (error.mean(1) < self.config.failure.mean)
         return ~fine, self.frame >= self.table.last[self.clip]
 
     def state_dict(self) -> dict:

@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinetok.config import ConfigError
 from kinetok.sim.batch import BodyState
-from kinetok.sim.tasks.tracking import Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, Tracking, TrackingConfig
 
 RNG = np.random.default_rng(0)
 
 
-def make(table, rows, future=(0, 1, 40), **kwargs) -> Tracking:
-    return Tracking(TrackingConfig(future=future), table, rows=rows, **kwargs)
+def make(table, rows, future=(0, 1, 40), failure=None, **kwargs) -> Tracking:
+    return Tracking(TrackingConfig(future=future, failure=failure or Failure()), table, rows=rows, **kwargs)
 
 
 def on_reference(table, task) -> BodyState:
@@ -136,6 +137,30 @@ def test_advance_and_over(table):
     assert task.over(on_reference(table, task))[1].tolist() == [False, True]
     task.advance()
     assert task.frame.tolist() == [3, 106]
+
+
+def test_slack_forgives_where_the_root_is_and_nothing_else(table):
+    """Rows moved by less than the slack, by more, moved and with a limb out of place, and lifted."""
+    task = begin(table, [0, 0, 0, 0], [5, 5, 5, 5], failure=Failure(slack=2.0))
+    body = on_reference(table, task)
+    body.pos[:3, :, :2] += np.array([[1.0, -1.0], [2.0, 2.0], [1.0, 0.0]], np.float32)[:, None]
+    body.pos[2, 3, 1] += 0.6
+    body.pos[3, :, 2] += 0.6
+    assert task.over(body)[0].tolist() == [False, True, True, True]
+    np.testing.assert_allclose(task.error[0], np.sqrt(2), atol=1e-5)  # what is reported is the whole error
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"mean": 0.0}, "mean must be above 0, not 0.0; its unit is metres"),
+        ({"largest": -1.0}, "largest must be above 0, not -1.0"),
+        ({"slack": -0.1}, "slack is metres that the root may be away by, 0 for none; not -0.1"),
+    ],
+)
+def test_failures_that_end_every_episode_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        Failure(**settings)
 
 
 @pytest.mark.parametrize(
