@@ -14,6 +14,8 @@ from kinetok.gpt.pretrain import PretrainConfig
 from kinetok.gpt.refine import RefineConfig
 from kinetok.rl.ppo import PPOConfig
 from kinetok.sim.env import EnvConfig
+from kinetok.sim.reward import TrackingReward
+from kinetok.sim.tasks.tracking import Failure
 from kinetok.tokenizers.distill import DistillStage
 from kinetok.tokenizers.fit import FitConfig
 from kinetok.tokenizers.fsq import FSQConfig
@@ -70,6 +72,23 @@ def generalist() -> FitConfig:
     )  # fmt: skip
 
 
+def robust() -> FitConfig:
+    """A continuous expert that is not thrown over: PPO under pushes of up to 1 m/s, from one that can follow the clips.
+
+    Where a push has moved the root to does not end an episode, and costs little: keeping upright comes first.
+    """
+    return replace(
+        generalist(),
+        stages=("ppo",),
+        ppo=PPOStage(
+            samples=4_000_000, eval_every=500_000, eval_episodes=8, eval_push=0.5, critic_warmup=10,
+            failure=Failure(largest=9.0, mean=0.4, slack=3.0), reward=TrackingReward(position=(0.5, -20.0)),
+            env=EnvConfig(reset_noise=0.02, push=1.0, push_seconds=1.5),
+            ppo=PPOConfig(lr=1e-5, gamma=0.98, horizon=32, minibatch=2048),
+        ),
+    )  # fmt: skip
+
+
 def from_scratch() -> FitConfig:
     """The paper's form: end-to-end PPO through the bottleneck from random weights, nothing else."""
     return FitConfig(
@@ -107,6 +126,7 @@ FIT = {
     "one-clip": one_clip,
     "many-clips": many_clips,
     "generalist": generalist,
+    "robust": robust,
     "from-scratch": from_scratch,
     "tiny": tiny,
 }

@@ -20,8 +20,10 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
 
     \b
     Presets: one-clip (minutes), many-clips (hours), generalist (one teacher
-    for many), from-scratch (end-to-end PPO alone), tiny (tests).
-    Example: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
+    for many), robust (a teacher that withstands pushes, from another one),
+    from-scratch (end-to-end PPO alone), tiny (tests).
+    Examples: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
+    kinetok tokenize fit --clips walk.txt --out runs/robust --preset robust --set start=humanoid-teacher
     """
     from kinetok import presets
     from kinetok.config import override, pick

@@ -42,9 +42,13 @@ class TrackingScore:
 
     @property
     def merit(self) -> float:
-        """One number for keeping the best checkpoint: success counts most, then the share survived, then the error."""
+        """One number for keeping the best checkpoint: success counts most, then the share survived, then the error.
+
+        Under pushes who was lost and did not fall counts as much as who succeeded.
+        """
         survived = self.seconds / np.maximum(self.limit, 1e-6)
-        return float((self.success + 0.2 * survived - np.minimum(self.mpjpe_mm, 500) / 1000).mean())
+        lost = self.survival - self.success_mean_error
+        return float((self.success + lost + 0.2 * survived - np.minimum(self.mpjpe_mm, 500) / 1000).mean())
 
     def summary(self) -> dict[str, float]:
         return {

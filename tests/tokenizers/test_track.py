@@ -87,6 +87,11 @@ def test_who_loses_its_place_has_failed_but_not_fallen(wave):
     assert stands.survival[0] == 1 and limp.survival[0] == 0
 
 
+def test_who_is_lost_and_has_not_fallen_has_merit(good):
+    lost = replace(good, success=0 * good.success, success_mean_error=0 * good.success)
+    assert lost.merit == pytest.approx(good.merit) and replace(lost, survival=0 * good.success).merit < lost.merit - 0.9
+
+
 def test_a_clip_survives_relative_to_how_long_it_could_last(good):
     """Halving what the short of two clips survives costs as much as halving the long one's: 0.2 * 0.5 / 2."""
     both = replace(good, seconds=np.array([1.0, 20.0]), limit=np.array([1.0, 20.0]))
