@@ -162,6 +162,9 @@ def test_clips_vary_makes_as_many_motions_as_asked_for(data_dir, tmp_path):
     assert (one.name, two.name) == ("walk-varied-1", "walk-varied-2") and not np.array_equal(one.qpos, two.qpos)
     assert kinetok("clips", "vary", walk, "--into", jog, "--seconds", 3, "--out", out).exit_code == 0
     assert [clip.name for clip in read_clips(out)] == ["walk-jog-varied"]
+    assert kinetok("clips", "vary", walk, "--style", 1, "--seconds", 3, "--count", 2, "--out", out).exit_code == 0
+    first, second = read_clips(out)
+    assert abs(first.qpos[0, 7:] - second.qpos[0, 7:]).max() > 0.05
 
 
 def test_fit_writes_every_stage_and_goes_on_where_it_was(run, clip):

@@ -114,12 +114,13 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
 @click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
 @click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
 @click.option("--into", default=None, help="A gait to go over into and back, in step: a file, or `stand`.")
+@click.option("--style", default=0.0, show_default=True, help="How much each motion differs from the walker's own way.")
 @click.option("--count", default=1, show_default=True, help="Motions to make, of seeds that follow one another.")
 @option_seed
 def clips_vary(
-    source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, count, seed
+    source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, style, count, seed
 ) -> None:
-    """Make long motions of a gait cycle: turning, hurrying, lingering, halting.
+    """Make long motions of a gait cycle: turning, hurrying, lingering, halting, and as other people would.
 
     \b
     A prior of straight walks has nothing to choose from; one of varied walks can be steered, and the more of them
@@ -127,15 +128,20 @@ def clips_vary(
     kinetok clips vary walk.txt --turn 80 --count 6 --out walk-varied.safetensors
     kinetok clips vary walk.txt --into jog.txt --out walk-jog.safetensors
     kinetok clips vary walk.txt --into stand --out walk-stand.safetensors
+    kinetok clips vary walk.txt --style 1 --count 16 --out walk-styles.safetensors
     """
+    from kinetok.motion.style import restyle
     from kinetok.motion.vary import standing, vary
 
     check_suffix(out, ".safetensors")
     clip, other = one_clip(source, name), None
     if into is not None:
         other = standing(clip) if into == "stand" else one_clip(Path(into), None)
-    told = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt, "into": other}
-    varied = [vary(clip, seed=seed + number, **told) for number in range(count)]
+    told = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt}
+    varied = []
+    for drawn in range(seed, seed + count):
+        pair = [c if c is None or not style else restyle(c, amount=style, seed=drawn) for c in (clip, other)]
+        varied.append(vary(pair[0], into=pair[1], seed=drawn, **told))
     if count > 1:
         varied = [replace(motion, name=f"{motion.name}-{number}") for number, motion in enumerate(varied, 1)]
     write_motion(out, *varied)
