@@ -73,7 +73,7 @@ def vary(
     if into is not None:
         share = (0.5 + DWELL * _wander(rng, steps, CHANGE)).clip(0, 1)
         qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
-        stands = not np.ptp(into.qpos[:, :2])
+        stands = np.ptp(into.qpos[:, :2]) < 1e-6
         qpos = _bend(qpos, bent * speed * (1 - share if stands else 1))  # who stands does not turn
         if stands:
             qpos[:, 2] -= np.minimum(lowest_point(Character.load(clip.character), qpos), 0)  # knees in step bend less

@@ -8,6 +8,7 @@ import pytest
 from kinetok import rotation
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.style import FPS, TEMPO, restyle
+from kinetok.motion.vary import standing, vary
 
 
 def slide(body, clip, plain) -> float:
@@ -59,6 +60,16 @@ def test_both_sides_change_alike(walk, humanoid):
     np.testing.assert_allclose(np.abs((quats[0] * quats[1]).sum(-1)), 1, atol=1e-3)
     angle = np.linalg.norm(rotation.to_rotvec(styled[:, 3:7]), axis=-1)
     assert angle.max() < 0.3 and not np.allclose(styled[:, 7:], still.qpos[:1, 7:], atol=1e-3)
+
+
+def test_a_styled_stand_stands(walk):
+    """So that `vary` knows it when a styled walk goes over into it."""
+    stand = restyle(standing(walk), seed=2)
+    assert np.ptp(stand.qpos[:, :2]) < 1e-9 and np.ptp(stand.qpos, axis=0).max() < 1e-9
+    varied = vary(restyle(walk, seed=2), seconds=40, turn=70, into=stand)
+    speed = np.linalg.norm(np.diff(varied.qpos[:, :2], axis=0), axis=1) * FPS
+    turn = np.abs(np.diff(np.unwrap(rotation.heading(varied.qpos[:, 3:7])))) * FPS
+    assert 0.02 < (speed < 0.01).mean() < 0.6 and turn[speed < 0.01].max() < 0.1
 
 
 def test_what_cannot_be_styled_is_refused(walk):
