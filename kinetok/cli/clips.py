@@ -137,11 +137,13 @@ def clips_vary(
     clip, other = one_clip(source, name), None
     if into is not None:
         other = standing(clip) if into == "stand" else one_clip(Path(into), None)
-    told = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt}
-    varied = []
+    told, varied = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt}, []
     for drawn in range(seed, seed + count):
-        pair = [c if c is None or not style else restyle(c, amount=style, seed=drawn) for c in (clip, other)]
-        varied.append(vary(pair[0], into=pair[1], seed=drawn, **told))
+        gait, into_gait = clip, other
+        if style:
+            gait = restyle(clip, amount=style, seed=drawn)
+            into_gait = restyle(other, amount=style, seed=drawn) if other else None
+        varied.append(vary(gait, into=into_gait, seed=drawn, **told))
     if count > 1:
         varied = [replace(motion, name=f"{motion.name}-{number}") for number, motion in enumerate(varied, 1)]
     write_motion(out, *varied)

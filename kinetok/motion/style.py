@@ -2,8 +2,9 @@
 
     clip = restyle(walk, amount=1.0, seed=3)          # a loop like the one given, with a pose and a stride of its own
 
-A tracker that knows two walkers follows no third (docs/log.md). A style is drawn once for the whole gait: every joint
-swings by more or less than it did, about a mean that is moved a little, alike on both sides; it is slower or faster.
+A tracker that knows two walkers follows no third (docs/log.md). A style is drawn once for the whole gait: legs,
+arms and trunk swing by more or less than they did, about a mean pose that is moved a little, alike on both sides; it is
+slower or faster.
 Then the body is put back on its feet: soles keep the tilt they had, the root stays as high above its lowest point as
 that was above the floor, and it travels as much further or less far as the standing foot says, so that it slides no
 more than it did.
@@ -40,12 +41,12 @@ def restyle(clip: Clip, *, amount: float = 1.0, seed: int = 0) -> Clip:
     frames = max(round(clip.seconds * FPS), 2)
     qpos = clip.at(np.arange(frames + 1) * clip.seconds / frames)
     motion = kinematics(body, qpos, FPS)
-    legs = _legs(body)
+    legs, arms = _carrying(body, "feet"), _carrying(body, "hands")
     angles = body.pose_to_ctrl(qpos)
     mean = angles[:-1].mean(0)
-    swing = _alike(body, np.where(legs, SWING["legs"], SWING["rest"]) * rng.uniform(-1, 1, body.nu) * amount, mean)
-    move = _alike(body, np.where(legs, MOVE["legs"], MOVE["rest"]) * rng.standard_normal(body.nu) * amount, mean)
-    swing[legs] = rng.uniform(-1, 1) * SWING["legs"] * amount  # one stride for hips and knees
+    stride, arm, trunk = rng.uniform(-1, 1, 3) * (SWING["legs"], SWING["rest"], SWING["rest"]) * amount
+    swing = np.where(legs, stride, np.where(arms, arm, trunk))
+    move = _alike(body, np.where(legs, MOVE["legs"], MOVE["rest"]) * rng.standard_normal(body.nu) * amount)
     styled = _pose(body, qpos, mean + move + (1 + swing) * (angles - mean))
     pitch = np.array([0.0, rng.standard_normal() * LEAN * amount, 0.0])
     styled[:, 3:7] = rotation.multiply(qpos[:, 3:7], rotation.from_rotvec(np.tile(pitch, (frames + 1, 1))))
@@ -63,13 +64,17 @@ def restyle(clip: Clip, *, amount: float = 1.0, seed: int = 0) -> Clip:
     )
 
 
-def _legs(body: Character) -> np.ndarray:
-    """Which actuators (nu,) move what carries the feet."""
-    chain = set()
-    for foot in body.bodies("feet"):
-        while body.parents[foot] >= 0:
-            chain.add(foot)
-            foot = body.parents[foot]
+def _carrying(body: Character, role: str) -> np.ndarray:
+    """Which actuators (nu,) move what carries one of the bodies of a role and none of the others; of a role that the
+    character does not name, none."""
+    chains = []
+    for end in body.bodies(role) if role in body.roles else []:
+        chain = set()
+        while body.parents[end] >= 0:
+            chain.add(end)
+            end = body.parents[end]
+        chains.append(chain)
+    chain = set().union(*(own.difference(*(other for other in chains if other is not own)) for own in chains))
     bodies = body.model.dof_bodyid[body.dof] - 1  # without the world
     return np.isin(bodies, list(chain))
 
@@ -87,7 +92,7 @@ def _pose(body: Character, qpos: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def _alike(body: Character, change: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def _alike(body: Character, change: np.ndarray) -> np.ndarray:
     """A change (nu,) of joint angles made the same for both sides, where the character has sides."""
     if "mirror" not in body.roles:
         return change

@@ -37,9 +37,8 @@ class DistillStage:
     memory: labelled states kept; noise: radians added to the student's targets while it acts; failure: when its
     episodes end; focus: how many times as often the clip that fails most may be drawn as the one that fails least;
     save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
-    often);
-    transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
-    reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
+    often); transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's
+    teacher; reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
 
     A clip that its own teacher cannot follow fails for ever, and takes its share for nothing: of K clips, one such
     leaves (K - 1) / (K - 1 + focus) of the states to the others: of 20 clips 2/3 with a focus of 10."""

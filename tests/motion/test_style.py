@@ -62,6 +62,17 @@ def test_both_sides_change_alike(walk, humanoid):
     assert angle.max() < 0.3 and not np.allclose(styled[:, 7:], still.qpos[:1, 7:], atol=1e-3)
 
 
+def test_both_sides_swing_as_much_more_or_less(walk, humanoid):
+    plain, styled = (humanoid.pose_to_ctrl(restyle(walk, amount=amount, seed=5).qpos) for amount in (0, 0.5))
+    hinges = humanoid.hinge[:, 1]
+    ratio = np.ptp(styled[:, hinges], axis=0) / np.ptp(plain[:, hinges], axis=0)
+    names = [humanoid.body_names[humanoid.model.dof_bodyid[humanoid.dof[u]] - 1] for u in hinges]
+    by_name = dict(zip(names, ratio, strict=True))
+    assert by_name["left_shin"] == pytest.approx(by_name["right_shin"], rel=0.02)
+    assert by_name["left_lower_arm"] == pytest.approx(by_name["right_lower_arm"], rel=0.02)
+    assert by_name["left_shin"] != pytest.approx(by_name["left_lower_arm"], rel=0.02) and abs(ratio - 1).max() > 0.05
+
+
 def test_a_styled_stand_stands(walk):
     """So that `vary` knows it when a styled walk goes over into it."""
     stand = restyle(standing(walk), seed=2)

@@ -170,12 +170,8 @@ class Tracking:
     def _leashed(self, body: BodyState, root: np.ndarray, reference: BodyState) -> tuple[np.ndarray, BodyState]:
         """Future roots (n, F, 3) and the reference, brought nearer by as much as it is beyond the leash."""
         away = reference.pos[:, 0, :2] - body.pos[:, 0, :2]
-        distance = np.sqrt(np.einsum("ni,ni->n", away, away))
-        far = np.flatnonzero(distance > self.config.leash)
-        if not len(far):
-            return root, reference
         beyond = np.zeros((len(away), 1, 3), dtype=np.float32)
-        beyond[far, 0, :2] = away[far] * (1 - self.config.leash / distance[far, None])
+        beyond[:, 0, :2] = away - _no_longer(away, self.config.leash)
         return root - beyond, replace(reference, pos=reference.pos - beyond)
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -191,12 +187,8 @@ class Tracking:
         offset = self.reference.pos - body.pos
         error = self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
         if self.config.failure.slack:
-            away = offset[:, 0, :2]
-            distance = np.sqrt(np.einsum("ni,ni->n", away, away))
             near = offset.copy()
-            near[..., :2] -= (away * (np.minimum(distance, self.config.failure.slack) / distance.clip(1e-6))[:, None])[
-                :, None
-            ]
+            near[..., :2] -= _no_longer(offset[:, :1, :2], self.config.failure.slack)
             error = np.sqrt(np.einsum("nbi,nbi->nb", near, near))
         fine = (error.max(1) < self.config.failure.largest) & (error.mean(1) < self.config.failure.mean)
         return ~fine, self.frame >= self.table.last[self.clip]
@@ -210,3 +202,9 @@ class Tracking:
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
         """Failure-weighted clip sampling learns from every finished episode."""
         self.weights.update(self.clip[ids], ~terminated)
+
+
+def _no_longer(vectors: np.ndarray, length: float) -> np.ndarray:
+    """Vectors (..., k) of at most that length."""
+    own = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
+    return vectors * np.minimum(1, length / own.clip(1e-6))
