@@ -53,7 +53,8 @@ class BatchSim:
 
     def __init__(self, model: mujoco.MjModel, rows: int, threads: int = 0):
         self.model, self.rows = model, rows
-        self._batch = Batch(model, rows, threads)
+        # Persistent: a step goes on from the kinematics that the last one ended with, instead of computing them again.
+        self._batch = Batch(model, rows, threads, persistent=True)
         self.qpos, self.qvel, self._ctrl = (self._batch.bind(n) for n in ("qpos", "qvel", "ctrl"))
         self._xpos, self._xmat, self._cvel, self._com = (
             self._batch.bind(n) for n in ("xpos", "xmat", "cvel", "subtree_com")

@@ -33,6 +33,7 @@ def scene_spec(character: Character, config: SceneConfig) -> mujoco.MjSpec:
     """The character on a floor, before it is compiled: the place to add to it."""
     spec = mujoco.MjSpec.from_string(character.xml)
     spec.modelname = f"kinetok-{character.name}"
+    spec.memory = 1 << 20  # bytes for contacts, of every row; a humanoid lying down takes a tenth (the default: 15 MB)
     option = spec.option
     option.timestep = 1 / (config.control_hz * config.substeps)
     option.solver = mujoco.mjtSolver.mjSOL_PGS
