@@ -54,6 +54,7 @@ class TrackingScore:
         return {
             "success": float(self.success.mean()),
             "success_mean_error": float(self.success_mean_error.mean()),
+            "survival": float(self.survival.mean()),
             "mpjpe_mm": float(self.mpjpe_mm.mean()),
             "seconds": float(self.seconds.mean()),
         }

@@ -22,6 +22,7 @@ from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_hea
 
 AHEAD = 2.0  # seconds that hindsight looks ahead at most
 WALKING, RESTING = 0.4, 0.15  # m/s over half a second
+STAY = 0.1  # metres to the nearest target of a demonstration
 STRIDE = 1.8  # metres that a demonstration wants to come nearer in a second
 
 
@@ -40,12 +41,13 @@ class TargetConfig:
 
     def __post_init__(self) -> None:
         check_ranges(seconds=self.seconds, distance=self.distance)
-        if self.distance[0] <= self.near:
-            raise ConfigError(f"distance {self.distance} begins within near {self.near} m: reached without a step")
+        if self.distance[1] <= self.near:
+            raise ConfigError(f"distance {self.distance} lies within near {self.near} m: reached without a step")
 
     def restless(self, seconds: tuple[float, float]) -> "TargetConfig":
-        """The same task, in which something else is asked after so many seconds."""
-        return replace(self, seconds=seconds)
+        """The same task, in which something else is asked after so many seconds, now and then to stay where one is:
+        who is sent on before it arrives never shows how to come to rest there."""
+        return replace(self, seconds=seconds, distance=(STAY, self.distance[1]))
 
 
 class Target:

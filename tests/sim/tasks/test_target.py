@@ -95,4 +95,12 @@ def test_reached_once_is_reached(humanoid):
 
 def test_a_target_under_the_feet_is_refused():
     with pytest.raises(ConfigError, match="reached without a step"):
-        TargetConfig(distance=(0.4, 3.0))
+        TargetConfig(distance=(0.1, 0.4))
+
+
+def test_demonstrations_ask_to_stay_too(humanoid):
+    task = make(humanoid, 256)
+    task.config = task.config.restless((0.4, 4.0))
+    task.start(np.arange(256), np.random.default_rng(0))
+    away = np.linalg.norm(task.target - task.world.root[:, :2], axis=1)
+    assert 0.05 < (away < task.config.near).mean() < 0.2 and away.max() > 4
