@@ -163,7 +163,8 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         folder = config.teachers or str(out / "teachers")
         places = [_place_of("teachers", folder, name) for name in names]
         known = {place: MotionTokenizer.from_pretrained(place) for place in dict.fromkeys(places)}
-        teachers = [known[place] for place in places]
+        same = {teacher.hash: teacher for teacher in known.values()}  # links and copies are labelled together
+        teachers = [same[known[place].hash] for place in places]
         parents |= {f"teacher/{name}": teacher.hash for name, teacher in zip(names, teachers, strict=True)}
         story += ["teacher", "distill"]
         scores["distill"] = distill(

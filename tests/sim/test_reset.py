@@ -15,6 +15,34 @@ def test_weights_by_hand():
     assert weights.values.tolist() == [0.1, 10.0, 1.0]
 
 
+def test_a_clip_gets_its_weight_of_the_states_however_long_its_episodes_last():
+    rng = np.random.default_rng(0)
+    weights = ClipWeights(3)
+    weights.values = np.array([1.0, 1.0, 2.0])
+    lasts = np.array([3, 300, 30])  # steps of an episode of each clip
+    clip = weights.draw(64, rng)
+    left = lasts[clip]
+    seen = np.zeros(3)
+    for step in range(6000):
+        weights.count(clip)
+        left -= 1
+        over = np.flatnonzero(left == 0)
+        clip[over] = weights.draw(len(over), rng)
+        left[over] = lasts[clip[over]]
+        seen += np.bincount(clip, minlength=3) * (step >= 2000)
+    assert seen / seen.sum() == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
+    # Drawn alike, by episodes, the first would have one state in a hundred.
+
+
+def test_the_state_of_the_weights_repeats_their_draws():
+    weights, again = ClipWeights(4), ClipWeights(4)
+    weights.update(np.array([1, 2]), np.array([True, False]))
+    weights.count(weights.draw(50, np.random.default_rng(1)))
+    again.load_state_dict(weights.state_dict())
+    drawn = [one.draw(100, np.random.default_rng(2)) for one in (weights, again, ClipWeights(4))]
+    assert (drawn[0] == drawn[1]).all() and (drawn[0] != drawn[2]).any()
+
+
 def test_perturb_turns_every_joint_by_the_scale_and_leaves_the_root_and_its_arguments_alone(humanoid):
     qpos = np.repeat(humanoid.model.qpos0[None], 4000, axis=0)
     qvel = np.zeros((4000, humanoid.nv))

@@ -111,9 +111,13 @@ class Entries:
     def _features(self) -> np.ndarray:
         return likeness(self._table.body.rows(self.frames))
 
+    @cached_property
+    def _lengths(self) -> np.ndarray:
+        return (self._features**2).sum(1)
+
     def squares(self, features: np.ndarray) -> np.ndarray:
         """Squared distances (N, E) of `likeness` features (N, F) from every entry, square metres."""
-        return (features**2).sum(1)[:, None] + (self._features**2).sum(1) - 2 * features @ self._features.T
+        return (features**2).sum(1)[:, None] + self._lengths - 2 * features @ self._features.T
 
 
 class Roaming(Graceful):

@@ -132,8 +132,7 @@ class Tracking:
         if self.fixed is not None:
             clip = self.fixed[ids]
         else:
-            edges = np.cumsum(self.weights.values)
-            clip = np.searchsorted(edges, rng.random(len(ids)) * edges[-1], side="right").clip(max=len(edges) - 1)
+            clip = self.weights.draw(len(ids), rng)
         if self.starts is not None:
             offset = self.starts[ids]
         else:
@@ -150,6 +149,7 @@ class Tracking:
         """Time goes on by one control step."""
         self.frame = np.minimum(self.frame + 1, self.table.last[self.clip])
         self.reference = self.table.body.rows(self.frame)
+        self.weights.count(self.clip)
 
     def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
         """state | window | error | target (n, O) float32 of all rows or of rows ids."""
@@ -194,10 +194,10 @@ class Tracking:
         return ~fine, self.frame >= self.table.last[self.clip]
 
     def state_dict(self) -> dict:
-        return {"weights": self.weights.values.tolist()}
+        return self.weights.state_dict()
 
     def load_state_dict(self, state: dict) -> None:
-        self.weights.values = np.array(state["weights"])
+        self.weights.load_state_dict(state)
 
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
         """Failure-weighted clip sampling learns from every finished episode."""
