@@ -26,6 +26,18 @@ from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 from kinetok.tokenizers.train import in_scene
 
+TURN = np.pi / 3  # radians to either side of straight ahead
+
+
+def forwards(wish: np.ndarray) -> np.ndarray:
+    """Wishes (N, 2) as long as they are, and at most TURN to the side: what lies behind is to be turned to.
+
+    No motion here goes backwards or sideways, so where that is asked for, standing still misses by least, for ever.
+    """
+    length = np.linalg.norm(wish, axis=1)
+    angle = np.arctan2(wish[:, 1], wish[:, 0]).clip(-TURN, TURN)
+    return np.stack([length * np.cos(angle), length * np.sin(angle)], axis=1)
+
 
 class Place:
     """Where rows would be had they never been moved: world = turned by `angle` (N,) and shifted by `shift` (N, 2)."""
@@ -93,7 +105,7 @@ def demonstrate(
         for t in range(steps):
             there = place.seen(body)
             asking = goal.observe(there)[:, asked]
-            task.wish[:] = goal.wish(asking)
+            task.wish[:] = forwards(goal.wish(asking))
             seen = torch.from_numpy(obs)
             codes = tokenizer.encode(seen)
             states[t], c[t], tokens[t] = seen[:, part], torch.from_numpy(asking), layout.to_tokens(codes)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from kinetok import rotation
-from kinetok.adapters.guide import Place, demonstrate
+from kinetok.adapters.guide import Place, demonstrate, forwards
 from kinetok.adapters.rlft import task_of
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks import TargetConfig
@@ -40,3 +40,10 @@ def test_a_demonstration_repeats_and_holds_what_was_asked(prior, table):
     assert 0.1 < float(c.norm(dim=1).max()) < 12
     assert all(torch.equal(a, b) for a, b in zip((states, c, tokens), run(1, threads=2), strict=True))
     assert not torch.equal(states[:8], run(2)[0][:8])
+
+
+def test_what_lies_behind_is_turned_to():
+    wish = np.array([[1, 0], [1, 1], [0, -2], [-3, 1e-3], [0, 0]])
+    # straight on and 45 degrees stay; to the right and behind left become 60 degrees, as long as they were
+    expected = [[1, 0], [1, 1], [1, -(3**0.5)], [1.5, 1.5 * 3**0.5], [0, 0]]
+    np.testing.assert_allclose(forwards(wish), expected, atol=1e-6)

@@ -23,7 +23,8 @@ from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_hea
 AHEAD = 2.0  # seconds that hindsight looks ahead at most
 WALKING, RESTING = 0.4, 0.15  # m/s over half a second
 STAY = 0.1  # metres to the nearest target of a demonstration
-STRIDE = 1.8  # metres that a demonstration wants to come nearer in a second
+STRIDE = 1.2  # metres that a demonstration wants to come nearer in a second
+REST = 0.6  # of `near`: where it wants to come to rest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +140,8 @@ class Target:
 
     def wish(self, c: np.ndarray) -> np.ndarray:
         """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 4)."""
-        return c[:, :2] * (STRIDE / length(c[:, :2]).clip(STRIDE))[:, None]
+        distance = length(c[:, :2])
+        return c[:, :2] * ((distance - REST * self.config.near).clip(0, STRIDE) / distance.clip(1e-6))[:, None]
 
     def markers(self, row: int) -> list[Marker]:
         """A disc as large as `near` and a pole at the target, and a line to it; green once it has been reached."""

@@ -104,3 +104,9 @@ def test_demonstrations_ask_to_stay_too(humanoid):
     task.start(np.arange(256), np.random.default_rng(0))
     away = np.linalg.norm(task.target - task.world.root[:, :2], axis=1)
     assert 0.05 < (away < task.config.near).mean() < 0.2 and away.max() > 4
+
+
+def test_a_demonstration_wants_to_come_nearer_and_to_rest_before_the_middle(humanoid):
+    # 5 m away: as far as a demonstration goes in a second; 0.8 m: to 0.6 of near = 0.5 m; 0.2 m: nowhere
+    c = np.array([[3, 4, 0.6, 0.8], [0, -0.8, 0, -1], [0.2, 0, 1, 0]], np.float32)
+    np.testing.assert_allclose(make(humanoid, 3).wish(c), [[0.72, 0.96], [0, -0.5], [0, 0]], atol=1e-6)
