@@ -62,7 +62,7 @@ def generalist() -> FitConfig:
     """One continuous expert of many clips, to teach others: what `teachers` know, gone on with by PPO on all clips."""
     return FitConfig(
         stages=("distill", "ppo"),
-        tokenizer=replace(FitConfig().teacher_tokenizer, encoder=(384,), decoder=(192,),
+        tokenizer=replace(FitConfig().teacher_tokenizer, encoder=(512,), decoder=(256,),
                           encoder_inputs=("state", "window", "error")),
         distill=DistillStage(samples=1_000_000, rows=512, transitions=0.15, reach_at_end=0.6, eval_every=250_000,
                              eval_episodes=4, save_every=1_000_000, env=EnvConfig(reset_noise=0.02, push=0.3)),
