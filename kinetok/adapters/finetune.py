@@ -18,6 +18,7 @@ adapter alone; the prior stays an artifact of its own, found by the place noted 
 What it began with is noted too, as its parent "skill".
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -53,7 +54,8 @@ class FinetuneConfig:
     """task; adapter: its kind and shape; methods: of sft, hindsight, rl, in this order; sft; hindsight; policy: how
     tokens are drawn; samples: control steps of rl, in `rows` worlds; eval_every: samples between evaluations of
     `eval_episodes` episodes of eval_seconds; critic: widths of the value network on state and task; critic_warmup:
-    first iterations that leave the adapter alone; env: the worlds of rl, in the tokenizer's scene; ppo."""
+    first iterations that leave the adapter alone; anchor: pull towards the adapter that rl began with, per nat and
+    step; env: the worlds of rl, in the tokenizer's scene; ppo."""
 
     task: GoalConfig = TargetConfig()
     adapter: AdapterConfig = CoLAConfig(rank=16, alpha=32.0)
@@ -68,6 +70,7 @@ class FinetuneConfig:
     eval_seconds: float = 20.0
     critic: tuple[int, ...] = (256, 128)
     critic_warmup: int = 6
+    anchor: float = 0.0
     env: EnvConfig = EnvConfig(episode_seconds=16.0)
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
@@ -84,6 +87,8 @@ class FinetuneConfig:
         for name in ("samples", "rows", "eval_every", "eval_episodes"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.anchor >= 0:
+            raise ConfigError(f"anchor must be at least 0, not {self.anchor}; 0 is none")
         if self.eval_seconds < 0.1:
             raise ConfigError(f"eval_seconds must be at least 0.1, not {self.eval_seconds}")
 
@@ -360,7 +365,8 @@ def _reinforce(
     task = task_of(config.task, skill.prior, config.rows)
     world = in_scene(config.env, skill.prior.tokenizer.config.scene)
     env = Env(world, task, rows=config.rows, threads=threads, seed=seed)
-    policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy)
+    begun = copy.deepcopy(skill.adapted).requires_grad_(False) if config.anchor else None
+    policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy, begun, config.anchor)
     torch.manual_seed(seed)  # an earlier method may have run in this process or in another one
     run = Training(
         out=out,

@@ -39,12 +39,13 @@ class Drawn:
 
 @dataclass(frozen=True, kw_only=True)
 class Scored:
-    """log_prob: (N,), of the tokens of a step. entropy: (N,). kl: (N,), from the base restricted to the same
-    options, or None where it was not asked for. All in nats, of one control step."""
+    """log_prob: (N,), of the tokens of a step. entropy: (N,). kl, anchor: (N,), from the base and from the anchor
+    restricted to the same options, or None where it was not asked for. All in nats, of one control step."""
 
     log_prob: Tensor
     entropy: Tensor
     kl: Tensor | None
+    anchor: Tensor | None
 
 
 def new_caches(adapted: Adapted, rows: int) -> tuple[KVCache, KVCache]:
@@ -110,10 +111,12 @@ def score(
     temperature: float = 1.0,
     guidance: float = 1.0,
     reference: bool = False,
+    anchor: Adapted | None = None,
 ) -> Scored:
     """What the policy says now of tokens (N, S) drawn with the mask keep (N, S, D, K), differentiably.
 
-    One teacher-forced pass; reference: with the KL from the base, at the cost of a second without gradient.
+    One teacher-forced pass. reference: with the KL from the base; anchor: with the KL from this adapted model; each at
+    the cost of a pass without gradient.
     """
     _check(adapted, temperature)
     logits, plain = adapted(state, c, tokens) / temperature, None
@@ -125,11 +128,22 @@ def score(
     taken = log_p.gather(-1, adapted.base.split(tokens)[..., None])
     log_p = log_p.masked_fill(~keep, 0.0)  # where p = 0: p log p is 0, not nan
     p = log_p.exp() * keep
-    kl = None
-    if reference and plain is not None:
-        log_q = F.log_softmax(restrict(plain, keep), dim=-1)
-        kl = (p * (log_p - log_q.masked_fill(~keep, 0.0))).sum((1, 2, 3))
-    return Scored(log_prob=taken.sum((1, 2, 3)), entropy=-(p * log_p).sum((1, 2, 3)), kl=kl)
+
+    def divergence(logits: Tensor) -> Tensor:
+        log_q = F.log_softmax(restrict(logits, keep), dim=-1)
+        return (p * (log_p - log_q.masked_fill(~keep, 0.0))).sum((1, 2, 3))
+
+    pull = None
+    if anchor is not None:
+        with torch.no_grad():
+            held = anchor(state, c, tokens) / temperature
+        pull = divergence(held if plain is None else guided(plain, held, guidance))
+    return Scored(
+        log_prob=taken.sum((1, 2, 3)),
+        entropy=-(p * log_p).sum((1, 2, 3)),
+        kl=divergence(plain) if reference and plain is not None else None,
+        anchor=pull,
+    )
 
 
 def guided(plain: Tensor, bent: Tensor, guidance: float) -> Tensor:

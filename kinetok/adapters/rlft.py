@@ -51,10 +51,20 @@ class TokenPolicyConfig:
 
 
 class TokenPolicy:
-    """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them."""
+    """What PPO trains (rl.policy.Policy): an adapted prior that draws tokens, and the frozen decoder that acts them.
 
-    def __init__(self, adapted: Adapted, tokenizer: MotionTokenizer, config: TokenPolicyConfig):
+    `anchor` is a frozen copy, towards whose distribution the policy is pulled with `pull` a nat and step."""
+
+    def __init__(
+        self,
+        adapted: Adapted,
+        tokenizer: MotionTokenizer,
+        config: TokenPolicyConfig,
+        anchor: Adapted | None = None,
+        pull: float = 0.0,
+    ):
         self.adapted, self.tokenizer, self.config = adapted, tokenizer, config
+        self.anchor, self.pull = anchor, pull
         self.tokens, self.state_dim = tokenizer.layout, adapted.base.config.state_dim
         self._caches = new_caches(adapted, 1)
 
@@ -88,11 +98,14 @@ class TokenPolicy:
             temperature=config.temperature,
             guidance=config.guidance,
             reference=config.kl > 0,
+            anchor=self.anchor,
         )
         entropy = found.entropy.mean()
         loss, metrics = -config.entropy * entropy, {"entropy": entropy.detach()}
         if found.kl is not None:
             loss, metrics = loss + config.kl * found.kl.mean(), metrics | {"kl_prior": found.kl.mean().detach()}
+        if found.anchor is not None:
+            loss, metrics = loss + self.pull * found.anchor.mean(), metrics | {"anchor": found.anchor.mean().detach()}
         # Schulman's low-variance estimate of KL(then || now), from what was drawn then.
         change = (found.log_prob - taken["log_prob"]).detach()
         return Assessment(log_prob=found.log_prob, kl=(change.exp() - 1 - change).mean(), loss=loss, metrics=metrics)

@@ -18,7 +18,8 @@ from kinetok.motion.character import Character
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """qpos (T, nq), qvel (T, nv); xpos (T, B, 3) m, xquat (T, B, 4), linear and angular (T, B, 3) m/s, rad/s, world."""
+    """qpos (T, nq), qvel (T, nv); xpos (T, B, 3) m, xquat (T, B, 4), linear and angular (T, B, 3) m/s, rad/s, world;
+    com (T, 3), the whole body's centre of mass."""
 
     qpos: np.ndarray
     qvel: np.ndarray
@@ -26,6 +27,7 @@ class Motion:
     xquat: np.ndarray
     linear: np.ndarray
     angular: np.ndarray
+    com: np.ndarray
 
 
 def velocities(body: Character, qpos: np.ndarray, fps: float) -> np.ndarray:
@@ -56,6 +58,7 @@ def kinematics(body: Character, qpos: np.ndarray, fps: float) -> Motion:
         xquat=out["xquat"][:, 1:].copy(),
         linear=cvel[..., 3:] + np.cross(cvel[..., :3], arm),
         angular=cvel[..., :3].copy(),
+        com=out["subtree_com"][:, 1].copy(),
     )
 
 

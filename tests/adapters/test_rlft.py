@@ -1,5 +1,6 @@
 """rlft.py: what PPO is told of a step of tokens, by hand; learning within the nucleus; playing a task."""
 
+import copy
 import json
 from math import log
 from types import SimpleNamespace
@@ -86,6 +87,28 @@ def test_a_step_by_hand(policy):
     torch.testing.assert_close(ratio, expected, rtol=1e-4, atol=1e-5)
     clipped = -torch.min(expected, expected.clamp(0.8, 1.2)).mean()  # all advantages 1
     torch.testing.assert_close(surrogate(ratio.log(), torch.ones(4000), 0.2), clipped, rtol=1e-4, atol=1e-5)
+
+
+def test_the_anchor_pulls_towards_what_it_was_by_hand(policy):
+    obs = torch.zeros(50, 1)
+    _, taken = policy.draw(obs, seeded())
+    held = TokenPolicy(
+        policy.adapted, policy.tokenizer, TokenPolicyConfig(top_p=0.7), copy.deepcopy(policy.adapted), 0.3
+    )
+    at_rest = held.assess(obs, taken)
+    assert abs(at_rest.loss.item()) < 1e-6
+    weigh(policy.adapted.gpt, NOW)  # (.75, .25) of the two that are left, from (.4, .6)
+    divergence = 2 * (0.75 * log(0.75 / 0.4) + 0.25 * log(0.25 / 0.6))  # 0.5051
+    judged = held.assess(obs, taken)
+    assert judged.metrics["anchor"] == pytest.approx(divergence, rel=1e-4)
+    assert judged.loss.item() == pytest.approx(0.3 * divergence, rel=1e-4)
+    for _ in range(300):  # with nothing else to learn it goes back, and the anchor stays where it is
+        loss = held.assess(obs, taken).loss
+        (gradient,) = torch.autograd.grad(loss, policy.adapted.gpt.head.out.bias)
+        with torch.no_grad():
+            policy.adapted.gpt.head.out.bias -= 2 * gradient
+    found = policy.adapted.gpt.head.out.bias.detach()[:2].softmax(-1)
+    torch.testing.assert_close(found, torch.tensor([0.4, 0.6]), rtol=0, atol=0.01)
 
 
 def test_the_loss_of_a_step_has_the_gradient_of_its_parts(policy):

@@ -4,9 +4,10 @@
 
 The file is y up and faces +x; its joints are those of the built-in humanoid. Reading normalises the
 quaternions, aligns their signs, resamples uneven frame durations to the median rate, closes the cycle of a
-"wrap" loop over its last quarter second (many files miss their own start by up to one radian) and puts the
-lowest foot on the ground. Refused, naming file, frame and column: anything but numbers, other column counts,
-values that are not finite or beyond a million, zero quaternions, fewer than two frames of positive duration.
+"wrap" loop over its last quarter second (many files miss their own start by up to one radian) and puts every
+frame on the ground (`motion.ground`; some float by 0.1 m). Refused, naming file, frame and column: anything but
+numbers, other column counts, values that are not finite or beyond a million, zero quaternions, fewer than two
+frames of positive duration.
 """
 
 import json
@@ -18,7 +19,7 @@ from kinetok import rotation
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip, close_loop, interpolate
 from kinetok.motion.error import FormatError
-from kinetok.motion.kinematics import lowest_point
+from kinetok.motion.ground import floor_height
 
 COLUMNS = 44
 # file order: joint name in our MJCF, width in the file, sign of a hinge
@@ -55,7 +56,7 @@ def read_deepmimic(path: Path, *, close: bool = True) -> Clip:
         qpos = _resample(path, body, qpos, times, fps)
     if loop and close:
         qpos = close_loop(body, qpos, max(1, round(CLOSE_SECONDS * fps)))
-    qpos[:, 2] -= np.percentile(lowest_point(body, qpos), 5)
+    qpos[:, 2] -= floor_height(body, qpos, fps, loop=loop and close)
     name = path.stem.removeprefix("humanoid3d_")
     return Clip(name=name, character="humanoid", fps=fps, qpos=qpos, loop=loop, source=str(path.name))
 
