@@ -58,6 +58,7 @@ class DistillStage:
     eval_every: int = 50_000
     eval_episodes: int = 16
     save_every: int = 400_000
+    bf16: bool = False
     env: EnvConfig = EnvConfig(reset_noise=0.01)
 
     def __post_init__(self) -> None:
@@ -144,7 +145,7 @@ def distill(
             loss = torch.zeros(())
             for _ in range(config.updates):
                 ids = torch.randint(filled, (config.minibatch,), generator=generator)
-                loss = _regress(student, optimizer, learner.seen(memory[ids]), labels[ids])
+                loss = _regress(student, optimizer, learner.seen(memory[ids]), labels[ids], bf16=config.bf16)
             step += 1
             samples = step * config.rows
             metrics = {"label_rmse": float(loss) ** 0.5} if step % 20 == 0 else {}
@@ -213,9 +214,12 @@ class _Views:
         return target
 
 
-def _regress(student: MotionTokenizer, optimizer: torch.optim.Optimizer, obs: Tensor, target: Tensor) -> Tensor:
-    mean, auxiliary, _ = student.act(obs)
-    loss = (mean - target).pow(2).mean()
+def _regress(
+    student: MotionTokenizer, optimizer: torch.optim.Optimizer, obs: Tensor, target: Tensor, *, bf16: bool
+) -> Tensor:
+    with torch.autocast(obs.device.type, torch.bfloat16, enabled=bf16):
+        mean, auxiliary, _ = student.act(obs)
+    loss = (mean.float() - target).pow(2).mean()
     if not torch.isfinite(loss):
         raise FloatingPointError(f"distillation loss is {loss.item()}; the last good state is kept")
     optimizer.zero_grad(set_to_none=True)

@@ -52,8 +52,11 @@ def same(a: dict, b: dict) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_the_student_learns_what_the_teachers_do(student, teachers, standing, config, tmp_path):
-    longer = replace(config, samples=100 * 32, eval_every=100 * 32, updates=3, minibatch=128, memory=3200, lr=3e-3)
+@pytest.mark.parametrize("bf16", [False, True])
+def test_the_student_learns_what_the_teachers_do(student, teachers, standing, config, tmp_path, bf16):
+    longer = replace(
+        config, samples=100 * 32, eval_every=100 * 32, updates=3, minibatch=128, memory=3200, lr=3e-3, bf16=bf16
+    )
     distill(student, teachers, standing, longer, tmp_path, quiet=True)
     errors = [line["label_rmse"] for line in untimed(tmp_path)]
     assert len(errors) == 5 and errors[-1] < 0.6 * errors[0]
