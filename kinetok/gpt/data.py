@@ -28,7 +28,7 @@ from kinetok.checkpoint import load_state, save_state
 from kinetok.logger import Logger
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.reset import StartWeights
+from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.matching import Matching
 from kinetok.sim.tasks.roaming import REACH, Roaming
 from kinetok.sim.tasks.tracking import ReferenceTable, TrackingConfig
@@ -182,8 +182,8 @@ def roam(
         task = Matching(tracking, table, rows=rows, rng=rng)
     else:
         task = Roaming(tracking, table, rows=rows, transitions=transitions, rng=rng, reach_at_end=reach_at_end)
-    task.weights = StartWeights(len(table.names), rate=1.0, bounds=(0.0, np.inf))  # whatever fails
-    task.weights.values *= clip_weights(table)[:, None]
+    task.weights = ClipWeights(len(table.names), rate=1.0, bounds=(0.0, np.inf))  # whatever fails
+    task.weights.values = clip_weights(table)
     world = Env(in_scene(env or EnvConfig(), scene), task, rows=rows, threads=threads, seed=seed)
     steps, part = -(-samples // rows), task.layout["state"]
     rolled = Rollout.empty(steps, rows, part.stop - part.start, layout.tokens_per_step)

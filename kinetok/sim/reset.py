@@ -1,48 +1,44 @@
-"""Where episodes start: reference-state initialisation, clips and phases drawn by how often they fail."""
+"""Where episodes start: reference-state initialisation, and clips drawn by how often they fail."""
 
 import numpy as np
 
 from kinetok import rotation
 from kinetok.motion.character import Character
 
-CELLS = 8  # parts of a clip that are weighed on their own
 FADE = 0.998  # per control step: what was seen 500 steps ago counts a third
-TYPICAL = 100.0  # steps an episode is taken to last before a start has shown how long its own do
+TYPICAL = 100.0  # steps an episode is taken to last before a clip has shown how long its own do
 
 
-class StartWeights:
-    """Failure-weighted sampling (GPC eq. 9), of the parts in which an episode may start: w <- w * gamma**K where it
-    succeeded, w / gamma**K where it failed.
+class ClipWeights:
+    """Failure-weighted sampling (GPC eq. 9): w <- w * gamma**K on success, w / gamma**K on failure.
 
-    values: (K, CELLS), of the equal parts of each clip's cycle (the paper: of clips; ours: a motion is mostly lost
-    where it begins in the wrong phase, and never once it goes on). gamma**K is `rate`; weights stay within `bounds` so
-    that nothing is forgotten or takes all. A weight is a share of the *states*, not of the episodes: a start that fails
-    after half a second is drawn more often than one that goes on for thirty, else what cannot be followed yet is hardly
-    seen and never learned.
+    gamma**K is `rate`; weights stay within `bounds` so that no clip is forgotten or takes all. A clip's weight is its
+    share of the *states*, not of the episodes: episodes of a clip that fails after half a second are drawn more often
+    than those of one that goes on for thirty, else what cannot be followed yet is hardly seen and never learned.
     """
 
-    def __init__(self, clips: int, rate: float = 0.95, bounds: tuple[float, float] = (0.3, 3.0)):
-        self.values = np.ones((clips, CELLS))
+    def __init__(self, clips: int, rate: float = 0.98, bounds: tuple[float, float] = (0.3, 3.0)):
+        self.values = np.ones(clips)
         self.rate, self.bounds = rate, bounds
-        self._started = np.full(clips * CELLS, 1.0)
-        self._seen = np.full(clips * CELLS, TYPICAL)
+        self._started = np.full(clips, 1.0)
+        self._seen = np.full(clips, TYPICAL)
 
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Clips (count,) of new episodes, and where they start (count,), in cells from the clip's beginning."""
-        edges = np.cumsum(self.values.ravel() * (self._started + 1) / (self._seen + TYPICAL))
-        cells = np.searchsorted(edges, rng.random(count) * edges[-1], side="right").clip(max=len(edges) - 1)
-        self._started += np.bincount(cells, minlength=len(edges))
-        return cells // CELLS, cells % CELLS + rng.random(count)
+    def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Clips (count,) of new episodes."""
+        edges = np.cumsum(self.values * (self._started + 1) / (self._seen + TYPICAL))
+        clips = np.searchsorted(edges, rng.random(count) * edges[-1], side="right").clip(max=len(edges) - 1)
+        self._started += np.bincount(clips, minlength=len(edges))
+        return clips
 
-    def count(self, clips: np.ndarray, cells: np.ndarray) -> None:
-        """One control step of rows whose episodes started in `cells` of `clips` (N,)."""
+    def count(self, clips: np.ndarray) -> None:
+        """One control step of rows that follow `clips` (N,)."""
         self._started *= FADE
-        self._seen = FADE * self._seen + np.bincount(clips * CELLS + cells, minlength=len(self._seen))
+        self._seen = FADE * self._seen + np.bincount(clips, minlength=len(self._seen))
 
-    def update(self, clips: np.ndarray, cells: np.ndarray, success: np.ndarray) -> None:
-        """Finished episodes: where they had started (E,) and whether each succeeded (E,)."""
-        count = np.bincount(clips * CELLS + cells, np.where(success, 1.0, -1.0), self.values.size)
-        self.values = np.clip(self.values * self.rate ** count.reshape(self.values.shape), *self.bounds)
+    def update(self, clips: np.ndarray, success: np.ndarray) -> None:
+        """Finished episodes: their clips (E,) and whether each succeeded (E,)."""
+        count = np.bincount(clips, np.where(success, 1.0, -1.0), len(self.values))
+        self.values = np.clip(self.values * self.rate**count, *self.bounds)
 
     def state_dict(self) -> dict:
         return {"weights": self.values.tolist(), "started": self._started.tolist(), "seen": self._seen.tolist()}

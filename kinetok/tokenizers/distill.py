@@ -22,7 +22,7 @@ from kinetok.logger import Logger
 from kinetok.resume import State
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
-from kinetok.sim.reset import StartWeights
+from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.roaming import REACH, Roaming
 from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.symmetry import Mirror
@@ -35,7 +35,7 @@ from kinetok.tokenizers.train import COUNTS, KINDS, identify, in_scene, refuse_o
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; noise: radians added to the student's targets while it acts; failure: when its
-    episodes end; focus: how many times as many states the start that fails most may have as the one that fails least;
+    episodes end; focus: how many times as many states the clip that fails most may have as the one that fails least;
     save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
     often); transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's
     teacher; reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
@@ -100,7 +100,7 @@ def distill(
     if config.transitions:
         rng, rate = np.random.default_rng([seed, 1]), config.transitions
         task = Roaming(tracking, table, rows=config.rows, transitions=rate, rng=rng, reach_at_end=config.reach_at_end)
-    task.weights = StartWeights(len(table.names), bounds=(config.focus**-0.5, config.focus**0.5))
+    task.weights = ClipWeights(len(table.names), bounds=(config.focus**-0.5, config.focus**0.5))
     env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
     flags = mirrored or [False] * len(teachers)
     views = _Views([_View(teacher.eval(), task, flag) for teacher, flag in zip(teachers, flags, strict=True)])

@@ -3,53 +3,43 @@
 import numpy as np
 import pytest
 
-from kinetok.sim.reset import CELLS, StartWeights, perturb
+from kinetok.sim.reset import ClipWeights, perturb
 
 
 def test_weights_by_hand():
-    weights = StartWeights(3, rate=0.5, bounds=(0.1, 10.0))
-    # clip 0, cell 2: two successes and a failure, net one success; clip 1, cell 7: a failure; nothing else
-    weights.update(np.array([0, 0, 0, 1]), np.array([2, 2, 2, 7]), np.array([True, True, False, False]))
-    expected = np.ones((3, CELLS))
-    expected[0, 2], expected[1, 7] = 0.5, 2.0
-    assert weights.values.tolist() == expected.tolist()
-    often = np.array([0] * 9 + [1] * 9), np.array([2] * 9 + [7] * 9), np.array([True] * 9 + [False] * 9)
-    weights.update(*often)
-    expected[0, 2], expected[1, 7] = 0.1, 10.0
-    assert weights.values.tolist() == expected.tolist()
+    weights = ClipWeights(3, rate=0.5, bounds=(0.1, 10.0))
+    # clip 0: two successes and a failure, net one success; clip 1: a failure; clip 2: nothing
+    weights.update(np.array([0, 0, 0, 1]), np.array([True, True, False, False]))
+    assert weights.values.tolist() == [0.5, 2.0, 1.0]
+    weights.update(np.array([0] * 9 + [1] * 9), np.array([True] * 9 + [False] * 9))
+    assert weights.values.tolist() == [0.1, 10.0, 1.0]
 
 
-def test_a_start_gets_its_weight_of_the_states_however_long_its_episodes_last():
+def test_a_clip_gets_its_weight_of_the_states_however_long_its_episodes_last():
     rng = np.random.default_rng(0)
-    weights = StartWeights(3)
-    weights.values[2] = 2.0
-    lasts = np.array([3, 300, 30])[:, None] + np.array([0] * 7 + [300])  # steps of an episode by clip and cell
-    clip, phase = weights.draw(512, rng)
-    cell = phase.astype(int)
-    left = lasts[clip, cell]
-    seen = np.zeros((3, CELLS))
+    weights = ClipWeights(3)
+    weights.values = np.array([1.0, 1.0, 2.0])
+    lasts = np.array([3, 300, 30])  # steps of an episode of each clip
+    clip = weights.draw(64, rng)
+    left = lasts[clip]
+    seen = np.zeros(3)
     for step in range(6000):
-        weights.count(clip, cell)
+        weights.count(clip)
         left -= 1
         over = np.flatnonzero(left == 0)
-        clip[over], phase = weights.draw(len(over), rng)
-        cell[over] = phase.astype(int)
-        left[over] = lasts[clip[over], cell[over]]
-        np.add.at(seen, (clip, cell), step >= 2000)
-    share = seen / seen.sum()
-    assert share.sum(1) == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
-    assert share == pytest.approx(weights.values / weights.values.sum(), abs=0.015)
-    # Drawn alike, by episodes, the first cell of the first clip would have one state in a thousand.
+        clip[over] = weights.draw(len(over), rng)
+        left[over] = lasts[clip[over]]
+        seen += np.bincount(clip, minlength=3) * (step >= 2000)
+    assert seen / seen.sum() == pytest.approx([0.25, 0.25, 0.5], abs=0.03)
+    # Drawn alike, by episodes, the first would have one state in a hundred.
 
 
 def test_the_state_of_the_weights_repeats_their_draws():
-    weights, again = StartWeights(4), StartWeights(4)
-    weights.update(np.array([1, 2]), np.array([0, 5]), np.array([True, False]))
-    clips, phases = weights.draw(50, np.random.default_rng(1))
-    assert (phases.astype(int) < CELLS).all()
-    weights.count(clips, phases.astype(int))
+    weights, again = ClipWeights(4), ClipWeights(4)
+    weights.update(np.array([1, 2]), np.array([True, False]))
+    weights.count(weights.draw(50, np.random.default_rng(1)))
     again.load_state_dict(weights.state_dict())
-    drawn = [one.draw(100, np.random.default_rng(2))[1] for one in (weights, again, StartWeights(4))]
+    drawn = [one.draw(100, np.random.default_rng(2)) for one in (weights, again, ClipWeights(4))]
     assert (drawn[0] == drawn[1]).all() and (drawn[0] != drawn[2]).any()
 
 

@@ -20,7 +20,7 @@ from kinetok.motion.kinematics import kinematics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim import observe
 from kinetok.sim.batch import BodyState
-from kinetok.sim.reset import CELLS, StartWeights
+from kinetok.sim.reset import ClipWeights
 from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
 
 
@@ -94,8 +94,8 @@ class ReferenceTable:
 class Tracking:
     """The tracking task of `rows` worlds.
 
-    Episodes start anywhere in a clip (reference-state initialisation), clips and phases drawn by how often they fail.
-    `fixed` (rows,) pins each row to one clip and `starts` (rows,) to one frame of it, counted from its first.
+    Episodes start anywhere in a clip (reference-state initialisation), clips drawn by how often they fail. `fixed`
+    (rows,) pins each row to one clip and `starts` (rows,) to one frame of it, counted from its first.
     """
 
     def __init__(
@@ -108,11 +108,10 @@ class Tracking:
         starts: np.ndarray | None = None,
     ):
         self.config, self.table, self.character = config, table, table.character
-        self.weights = StartWeights(len(table.names))
+        self.weights = ClipWeights(len(table.names))
         self.fixed, self.starts = fixed, starts
         self.clip = np.zeros(rows, dtype=int)
         self.frame = np.zeros(rows, dtype=int)
-        self.cell = np.zeros(rows, dtype=int)  # part of the clip in which each row started
         self.reference = table.body.rows(self.frame)  # where each row should be now
         self.error = np.zeros((rows, len(self.character.body_names)), dtype=np.float32)
         self._future = np.array(config.future)
@@ -130,26 +129,27 @@ class Tracking:
     def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Poses and velocities of the frames at which rows ids begin."""
         table = self.table
-        clip, phase = self.weights.draw(len(ids), rng)
         if self.fixed is not None:
             clip = self.fixed[ids]
-        offset = (phase / CELLS * table.cycle[clip]).astype(int) if self.starts is None else self.starts[ids]
+        else:
+            clip = self.weights.draw(len(ids), rng)
+        if self.starts is not None:
+            offset = self.starts[ids]
+        else:
+            offset = (rng.random(len(ids)) * table.cycle[clip]).astype(int)
         self.place(ids, clip, table.first[clip] + offset)
-        self.cell[ids] = phase
         return table.qpos[self.frame[ids]], table.qvel[self.frame[ids]]
 
     def place(self, ids: np.ndarray, clip: np.ndarray, frame: np.ndarray) -> None:
         """Let rows ids follow `clip` (n,) from table frame `frame` (n,) on."""
         self.clip[ids], self.frame[ids] = clip, frame
-        cycle = self.table.cycle[clip]
-        self.cell[ids] = (frame - self.table.first[clip]) % cycle * CELLS // cycle
         self.reference.assign_(ids, self.table.body.rows(frame))
 
     def advance(self) -> None:
         """Time goes on by one control step."""
         self.frame = np.minimum(self.frame + 1, self.table.last[self.clip])
         self.reference = self.table.body.rows(self.frame)
-        self.weights.count(self.clip, self.cell)
+        self.weights.count(self.clip)
 
     def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
         """state | window | error | target (n, O) float32 of all rows or of rows ids."""
@@ -200,8 +200,8 @@ class Tracking:
         self.weights.load_state_dict(state)
 
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
-        """Failure-weighted sampling learns from every finished episode."""
-        self.weights.update(self.clip[ids], self.cell[ids], ~terminated)
+        """Failure-weighted clip sampling learns from every finished episode."""
+        self.weights.update(self.clip[ids], ~terminated)
 
 
 def _no_longer(vectors: np.ndarray, length: float) -> np.ndarray:

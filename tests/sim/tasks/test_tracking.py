@@ -7,7 +7,6 @@ import pytest
 
 from kinetok.config import ConfigError
 from kinetok.sim.batch import BodyState
-from kinetok.sim.reset import CELLS
 from kinetok.sim.tasks.tracking import Failure, Tracking, TrackingConfig
 
 RNG = np.random.default_rng(0)
@@ -116,18 +115,13 @@ def test_starts_are_uniform_over_the_cycle(table):
         assert len(counts) == cycle and counts.min() > 0.5 * counts.mean()
 
 
-def test_starts_that_fail_are_drawn_more_often(table):
-    task = make(table, 6000)
-    task.clip[:], task.cell[:] = 1, 3
-    task.finished(np.arange(20), np.ones(20, dtype=bool))
-    weight = 0.95**-20
-    expected = np.ones((2, CELLS))
-    expected[1, 3] = weight
-    np.testing.assert_allclose(task.weights.values, expected)
-    task.start(np.arange(6000), np.random.default_rng(0))
-    assert ((task.clip == 1) & (task.cell == 3)).mean() == pytest.approx(weight / (weight + 2 * CELLS - 1), abs=0.02)
-    offset, cycle = task.frame - table.first[task.clip], table.cycle[task.clip]
-    np.testing.assert_array_less(np.abs(offset / cycle * CELLS - task.cell - 0.5), 0.5 + CELLS / cycle)
+def test_clips_that_fail_are_drawn_more_often(table):
+    task = make(table, 4000)
+    task.clip[:] = 1
+    task.finished(np.arange(30), np.ones(30, dtype=bool))
+    assert task.weights.values == pytest.approx([1.0, 0.98**-30])
+    task.start(np.arange(4000), np.random.default_rng(0))
+    assert (task.clip == 1).mean() == pytest.approx(0.98**-30 / (1 + 0.98**-30), abs=0.03)
     other = make(table, 1)
     other.load_state_dict(task.state_dict())
     np.testing.assert_array_equal(other.weights.values, task.weights.values)
