@@ -27,7 +27,7 @@ def floor_height(body: Character, qpos: np.ndarray, fps: float, *, loop: bool = 
     if loop:  # the cycle before and the one after
         low, height = (np.concatenate([x[:-1], x[:-1], x]) for x in (low, height))
     falls = np.gradient(np.gradient(gaussian_filter1d(height, SMOOTH * fps), 1 / fps), 1 / fps) < FALL
-    flies = binary_dilation(falls, iterations=max(round(EDGE * fps), 1))
+    flies = np.asarray(binary_dilation(falls, iterations=max(round(EDGE * fps), 1)), dtype=bool)
     slow = np.abs(np.gradient(low, 1 / fps)) < SLOW
     stands = (~flies & slow & (low < NEAR)) | (low <= 0)
     frames = np.arange(len(low))
