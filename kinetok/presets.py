@@ -89,6 +89,24 @@ def robust() -> FitConfig:
     )  # fmt: skip
 
 
+def acrobat() -> FitConfig:
+    """A continuous expert of leaps, flips and dances, by PPO from one that can walk and run.
+
+    Half a metre from its place it goes on all the same: who is stopped there never learns to land (docs/log.md).
+    """
+    return replace(
+        generalist(),
+        stages=("ppo",),
+        ppo=PPOStage(
+            samples=6_000_000, eval_every=500_000, eval_episodes=8, critic_warmup=10, log_std=(-2.3, -2.9),
+            failure=Failure(largest=1.2, mean=0.6),
+            reward=TrackingReward(position=(0.5, -20.0), height=(0.2, -20.0)),
+            env=EnvConfig(reset_noise=0.01),
+            ppo=PPOConfig(lr=1e-5),
+        ),
+    )  # fmt: skip
+
+
 def from_scratch() -> FitConfig:
     """The paper's form: end-to-end PPO through the bottleneck from random weights, nothing else."""
     return FitConfig(
@@ -127,6 +145,7 @@ FIT = {
     "many-clips": many_clips,
     "generalist": generalist,
     "robust": robust,
+    "acrobat": acrobat,
     "from-scratch": from_scratch,
     "tiny": tiny,
 }
