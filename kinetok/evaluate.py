@@ -48,6 +48,7 @@ def evaluate_tracking(
     episodes: int = 8,
     seed: int = 0,
     push: float = 0.0,
+    from_start: bool = False,
     threads: int = 0,
 ) -> dict[str, Any]:
     """Track every clip `episodes` times with mean actions; see tokenizers.track for episodes, success and error.
@@ -65,6 +66,7 @@ def evaluate_tracking(
         scene=config.scene,
         episodes=episodes,
         push=push,
+        from_start=from_start,
         threads=threads,
         seed=seed,
     )
@@ -82,6 +84,7 @@ def evaluate_tracking(
         "perplexity": None,
         "episodes": episodes,
         "push_mps": push,
+        "from_start": from_start,
         "seed": seed,
     } | listener.usage()
 

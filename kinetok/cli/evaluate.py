@@ -16,15 +16,25 @@ def evaluate() -> None:
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@click.option("--from-start", is_flag=True, help="Begin loops at their first frame alone, as papers do.")
 @option_threads
 @option_seed
-def evaluate_tracking(tokenizer, paths, out, episodes, push, threads, seed) -> None:
+def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads, seed) -> None:
     """Success rate and MPJPE of a tokenizer (or a teacher) on clips, by clip and overall."""
     from kinetok.evaluate import evaluate_tracking as score
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
     model = MotionTokenizer.from_pretrained(tokenizer)
-    show_json(score(model, load_clips(paths), episodes=episodes, push=push, threads=threads, seed=seed), out)
+    found = score(
+        model,
+        load_clips(paths),
+        episodes=episodes,
+        push=push,
+        from_start=from_start,
+        threads=threads,
+        seed=seed,
+    )
+    show_json(found, out)
 
 
 @evaluate.command("prior")

@@ -41,9 +41,12 @@ def test_a_loop_is_entered_at_phases_spread_over_it(wave):
     """Jumping by 2 m at frame 10 of 30, a loop loses every episode there; only the phases tell how late."""
     clip = wave("jump", 1.0, loop=True)
     clip.qpos[10:, 0] += 2.0
-    score = track(Follow(28), ReferenceTable(ClipLibrary.of([clip]), seconds=2), future=(1,), episodes=2, seconds=1.5)
+    table = ReferenceTable(ClipLibrary.of([clip]), seconds=2)
+    score = track(Follow(28), table, future=(1,), episodes=2, seconds=1.5)
     # the episode from frame 0 ends with its 10th step; that from frame 15 with its 25th, at frame 10 of the next cycle
     assert score.seconds.tolist() == [(10 + 25) / 2 / 30] and score.success.tolist() == [0.0]
+    begun = track(Follow(28), table, future=(1,), episodes=2, seconds=1.5, from_start=True)
+    assert begun.seconds.tolist() == [10 / 30]
 
 
 def test_a_broken_body_scores_less(standing, good):
