@@ -206,6 +206,7 @@ def tiny_skill() -> FinetuneConfig:
         samples=512,
         rows=32,
         eval_every=256,
+        save_every=1,
         eval_episodes=4,
         eval_seconds=1.0,
         critic=(16,),

@@ -53,9 +53,10 @@ JUDGE = 1_000_000  # added to the seed of a run: the episodes that choose its be
 class FinetuneConfig:
     """task; adapter: its kind and shape; methods: of sft, hindsight, rl, in this order; sft; hindsight; policy: how
     tokens are drawn; samples: control steps of rl, in `rows` worlds; eval_every: samples between evaluations of
-    `eval_episodes` episodes of eval_seconds; critic: widths of the value network on state and task; critic_warmup:
-    first iterations that leave the adapter alone; anchor: pull towards the adapter that rl began with, per nat and
-    step; env: the worlds of rl, in the tokenizer's scene; ppo."""
+    `eval_episodes` episodes of eval_seconds; save_every: samples between states to resume from, at the next evaluation
+    (the worlds begin anew there, so not too often); critic: widths of the value network on state and task;
+    critic_warmup: first iterations that leave the adapter alone; anchor: pull towards the adapter that rl began with,
+    per nat and step; env: the worlds of rl, in the tokenizer's scene; ppo."""
 
     task: GoalConfig = TargetConfig()
     adapter: AdapterConfig = CoLAConfig(rank=16, alpha=32.0)
@@ -66,6 +67,7 @@ class FinetuneConfig:
     samples: int = 3_000_000
     rows: int = 512
     eval_every: int = 200_000
+    save_every: int = 750_000
     eval_episodes: int = 64
     eval_seconds: float = 20.0
     critic: tuple[int, ...] = (256, 128)
@@ -84,7 +86,7 @@ class FinetuneConfig:
                 raise ConfigError(f"unknown method {method!r}{nearest(method, METHODS)}; methods: {', '.join(METHODS)}")
         if not self.methods or list(self.methods) != sorted(set(self.methods), key=METHODS.index):
             raise ConfigError(f"methods {', '.join(self.methods) or '(none)'}: name each once, sft before rl")
-        for name in ("samples", "rows", "eval_every", "eval_episodes"):
+        for name in ("samples", "rows", "eval_every", "eval_episodes", "save_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.anchor >= 0:
@@ -385,6 +387,7 @@ def _reinforce(
     progress = run.train(
         samples=config.samples,
         eval_every=config.eval_every,
+        save_every=config.save_every,
         evaluate=lambda: _judge(policy, skill, config, seed, threads),
         keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
         critic_warmup=config.critic_warmup,

@@ -44,11 +44,12 @@ S = TypeVar("S", bound=Score)
 @dataclass
 class Progress:
     """What a run knows of itself besides its tensors. best, score: merit and to_json() of what was kept; stale:
-    evaluations since; evaluated: samples at the last evaluation."""
+    evaluations since; evaluated, saved: samples at the last evaluation and at the last save."""
 
     iteration: int = 0
     samples: int = 0
     evaluated: int = 0
+    saved: int = 0
     best: float = -1e9
     stale: int = 0
     score: dict | None = None
@@ -87,6 +88,7 @@ class Training:
         keep: Callable[[S], None],
         finished: Callable[[Progress], bool] = lambda progress: False,
         schedule: Callable[[float], None] = lambda share: None,
+        save_every: int = 0,
         critic_warmup: int = 0,
         warm: bool = False,
         title: str = "ppo",
@@ -96,8 +98,9 @@ class Training:
         """Train until `samples` control steps are done or `finished` says so.
 
         keep: writes the artifact, called with each score that is the best so far. schedule: told the share done
-        before each rollout. critic_warmup: first iterations that leave the policy alone. warm: the policy's
-        normalisers come from an earlier training, and the first rollout does not reset them.
+        before each rollout. save_every: samples from a save to the evaluation that is followed by the next, 0 for every
+        one; after a save the worlds begin anew, so not too often. critic_warmup: first iterations that leave the policy
+        alone. warm: the policy's normalisers come from an earlier training, and the first rollout does not reset them.
         """
         progress = self.resume()
         per_iteration = self.world.rows * self.config.horizon
@@ -129,7 +132,8 @@ class Training:
                         keep(score)
                 metrics["reward"] = float(rollout.rewards.mean())  # a step; episodes' sums are of whole episodes alone
                 log.write(progress.samples, metrics | self.world.episode_metrics())
-                if due:
+                if due and (progress.samples - progress.saved >= save_every or progress.samples >= samples):
+                    progress.saved = progress.samples
                     self.save(progress)
                     obs = torch.from_numpy(self.world.reset(spread=True))
         return progress

@@ -58,6 +58,7 @@ class Task(Protocol):
     obs_size: int
 
     def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]: ...
+    def spread(self) -> None: ...
     def advance(self) -> None: ...
     def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray: ...
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]: ...
@@ -91,11 +92,14 @@ class Env:
         return self.task.character.nu
 
     def reset(self, *, spread: bool = False) -> np.ndarray:
-        """Start every row anew; observations (N, O). spread: ages drawn at random, so that rows do not end together."""
+        """Start every row anew; observations (N, O). spread: as if they had begun at different times, so that rows do
+        not end together, nor are asked for something else together: all turning at once, then all walking straight,
+        they teach a policy to forget the one while it learns the other (docs/log.md)."""
         ids = np.arange(self.rows)
         self._start(ids)
         if spread:
             self.age[:] = self.rng.integers(0, self.limit, self.rows)
+            self.task.spread()
         return self.task.observe(self.sim.state())
 
     def step(self, action: np.ndarray) -> Step:

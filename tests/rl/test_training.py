@@ -129,6 +129,25 @@ def test_a_resumed_run_is_the_unbroken_one(tmp_path, stop_at):
     assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
 
 
+def test_saved_at_some_evaluations_alone_a_resumed_run_is_the_unbroken_one(tmp_path):
+    Run(tmp_path / "whole").train(save_every=256)
+
+    def stop(reward):
+        steps.append(1)
+        if len(steps) == 28:  # after the third evaluation, which no save followed
+            raise KeyboardInterrupt
+        return reward
+
+    steps = []
+    with pytest.raises(KeyboardInterrupt):
+        Run(tmp_path / "cut", spoil=stop).train(save_every=256)
+    assert state(tmp_path / "cut")[1]["progress"]["samples"] == 256
+    Run(tmp_path / "cut").train(merits=[2.0, 3.0], save_every=256)
+    (tensors, meta), (expected, expected_meta) = state(tmp_path / "cut"), state(tmp_path / "whole")
+    assert all(torch.equal(tensors[k], expected[k]) for k in expected) and meta == expected_meta
+    assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
+
+
 def test_a_finished_run_does_nothing(tmp_path):
     Run(tmp_path).train()
     before = state(tmp_path)[1]

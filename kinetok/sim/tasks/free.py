@@ -46,6 +46,9 @@ class Free:
         self.drawn[ids] = rng.integers(len(self.qpos), size=len(ids)) if self.starts is None else self.starts[ids]
         return self.qpos[self.drawn[ids]], self.qvel[self.drawn[ids]]
 
+    def spread(self) -> None:
+        """Nothing is asked of a row."""
+
     def advance(self) -> None:
         """Nothing moves but the character."""
 

@@ -97,6 +97,10 @@ class Path:
         self._wait(ids)
         return qpos, qvel
 
+    def spread(self) -> None:
+        """What is asked of each row has been asked for a while."""
+        self.left = (self.left * self.world.rng.random(len(self.left))).astype(int)
+
     def advance(self) -> None:
         """Time goes on by one control step; all paths grow by an arc when the last point has come within `seconds`."""
         self.now += 1

@@ -80,6 +80,10 @@ class Steering:
         self._command(ids)
         return qpos, qvel
 
+    def spread(self) -> None:
+        """What is asked of each row has been asked for a while."""
+        self.left = (self.left * self.world.rng.random(len(self.left))).astype(int)
+
     def advance(self) -> None:
         """Time goes on by one control step; a command whose time is up gives way to the next."""
         self.left -= 1

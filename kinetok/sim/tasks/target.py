@@ -80,6 +80,10 @@ class Target:
         self._place(ids)
         return qpos, qvel
 
+    def spread(self) -> None:
+        """What is asked of each row has been asked for a while."""
+        self.left = (self.left * self.world.rng.random(len(self.left))).astype(int)
+
     def advance(self) -> None:
         """Time goes on by one control step; a target whose time is up gives way to one around the root as last seen."""
         self._success, self._final = self._none, self._none

@@ -140,6 +140,9 @@ class Tracking:
         self.place(ids, clip, table.first[clip] + offset)
         return table.qpos[self.frame[ids]], table.qvel[self.frame[ids]]
 
+    def spread(self) -> None:
+        """Rows begin anywhere as it is."""
+
     def place(self, ids: np.ndarray, clip: np.ndarray, frame: np.ndarray) -> None:
         """Let rows ids follow `clip` (n,) from table frame `frame` (n,) on."""
         self.clip[ids], self.frame[ids] = clip, frame

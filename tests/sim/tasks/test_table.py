@@ -94,6 +94,18 @@ def test_one_seed_is_one_history_at_any_thread_count(humanoid, name):
     assert (histories[0][:, :, task] != histories[2][:, :, task]).any()
 
 
+@pytest.mark.parametrize("name", ["target", "steering"])
+def test_spread_rows_are_asked_for_something_else_at_different_times(humanoid, name):
+    shape = TASKS[name][0]()
+    env = Env(EnvConfig(), build_task(shape, humanoid, *standing(humanoid, 4), rows=400), rows=400)
+    env.reset()
+    longest = shape.seconds[1] * 30
+    assert env.task.left.min() >= shape.seconds[0] * 30 - 1
+    env.reset(spread=True)
+    shares = np.histogram(env.task.left, bins=4, range=(0, longest))[0] / 400
+    assert shares[:3].min() > 0.15 and env.task.left.max() <= longest
+
+
 @EVERY
 def test_a_resumed_training_goes_on_as_it_would_have(humanoid, name):
     one, other = make(humanoid, name, episode_seconds=0.4), make(humanoid, name, seed=7, episode_seconds=0.4)
