@@ -16,7 +16,13 @@ def evaluate() -> None:
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
-@click.option("--from-start", is_flag=True, help="Begin loops at their first frame alone, as papers do.")
+@click.option(
+    "--from-start",
+    is_flag=True,
+    default=False,
+    show_default=True,
+    help="Begin loops at their first frame alone, as papers do.",
+)
 @option_threads
 @option_seed
 def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads, seed) -> None:
