@@ -114,11 +114,12 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
 @click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
 @click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
 @click.option("--into", default=None, help="A gait to go over into and back, in step: a file, or `stand`.")
+@click.option("--change", default=3.0, show_default=True, help="Seconds from one share of that gait to the next.")
 @click.option("--style", default=0.0, show_default=True, help="How much each motion differs from the walker's own way.")
 @click.option("--count", default=1, show_default=True, help="Motions to make, of seeds that follow one another.")
 @option_seed
 def clips_vary(
-    source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, style, count, seed
+    source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, change, style, count, seed
 ) -> None:
     """Make long motions of a gait cycle: turning, hurrying, lingering, halting, and as other people would.
 
@@ -137,7 +138,7 @@ def clips_vary(
     clip, other = one_clip(source, name), None
     if into is not None:
         other = standing(clip) if into == "stand" else one_clip(Path(into), None)
-    told, varied = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt}, []
+    told, varied = {"seconds": seconds, "turn": turn, "tempo": tempo, "halt": halt, "change": change}, []
     for drawn in range(seed, seed + count):
         gait, into_gait = clip, other
         if style:

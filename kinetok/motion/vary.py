@@ -31,7 +31,8 @@ from kinetok.motion.kinematics import kinematics, lowest_point
 VARIED = "-varied"
 FPS = 60.0
 WANDER = 1.5  # seconds from one random value of turn or tempo to the next
-CHANGE = 3.0  # seconds from one share of another gait to the next
+CHANGE = 3.0  # seconds from one share of another gait to the next, unless told
+SHORTEST = 0.5  # of these: less is a stumble
 SIDEWAYS = 2.2  # m/s^2 towards the inside of a turn at most, the pace of a jog that turns by 45 degrees/s
 RAMP = 0.5  # seconds to stop or to start
 STAY = (0.5, 2.5)  # seconds a halt lasts
@@ -48,19 +49,21 @@ def vary(
     tempo: float = 1.2,
     halt: float = 0.0,
     into: Clip | None = None,
+    change: float = CHANGE,
     seed: int = 0,
 ) -> Clip:
     """A motion of `seconds` made of a clip that begins and ends alike, or of as much of another one as there is.
 
     turn: degrees per second the path turns at most, to either side. tempo: it plays so many times as fast or slow at
     most. halt: seconds of moving between two halts on average; 0 for none. into: a gait, of one left and one right step
-    like `clip` itself, that it goes over into and back. The same seed gives the same motion.
+    like `clip` itself, that it goes over into and back; change: seconds from one share of it to the next. The same
+    seed gives the same motion.
     Raises ValueError for a motion that has no moment to halt at, naming its fastest foot.
     """
-    if not (seconds > 0 and turn >= 0 and tempo >= 1 and halt >= 0):
+    if not (seconds > 0 and turn >= 0 and tempo >= 1 and halt >= 0 and change >= SHORTEST):
         raise ValueError(
-            f"clip {clip.name!r}: seconds must be above 0, turn and halt not below 0, tempo at least 1; "
-            f"not {seconds}, {turn}, {halt}, {tempo}"
+            f"clip {clip.name!r}: seconds must be above 0, turn and halt not below 0, tempo at least 1, change "
+            f"at least {SHORTEST}; not {seconds}, {turn}, {halt}, {tempo}, {change}"
         )
     if into is not None and (halt or not (clip.loop and into.loop) or clip.character != into.character):
         raise ValueError(
@@ -71,13 +74,13 @@ def vary(
     bent, speed = _wander(rng, steps) * np.radians(turn), tempo ** _wander(rng, steps)
     source = f"varied by turn {turn:g} deg/s, tempo {tempo:g}, halt {halt:g} s, seed {seed}"
     if into is not None:
-        share = (0.5 + DWELL * _wander(rng, steps, CHANGE)).clip(0, 1)
+        share = (0.5 + DWELL * _wander(rng, steps, change)).clip(0, 1)
         qpos, name = _blend(clip, into, share, speed), f"{clip.name}-{into.name}{VARIED}"
         stands = np.ptp(into.qpos[:, :2]) < 1e-6
         qpos = _bend(qpos, bent * speed * (1 - share if stands else 1))  # who stands does not turn
         if stands:
             qpos[:, 2] -= np.minimum(lowest_point(Character.load(clip.character), qpos), 0)  # knees in step bend less
-        source = f"{clip.source} into {into.source}, {source}"
+        source = f"{clip.source} into {into.source} within {change:g} s, {source}"
         return replace(clip, name=name, fps=FPS, qpos=qpos, loop=False, source=source)
     phase = _play(speed, _quiet(clip) if halt else np.empty(0), halt, rng, clip)
     if not clip.loop:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from kinetok.config import ConfigError
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.rollout import Rollout
@@ -23,7 +24,8 @@ CHUNK = 1024  # samples of a minibatch whose gradients are taken at a time: what
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
     """horizon: steps per rollout; lr: starting rate of the policy, lr_max: its ceiling; target_kl: the divergence per
-    update it aims at."""
+    update it aims at, and at the last sample target_kl_end, 0 for the same all the time: large steps get there
+    sooner, small ones come to rest there."""
 
     horizon: int = 16
     epochs: int = 3
@@ -35,7 +37,19 @@ class PPOConfig:
     lr_max: float = 1e-3
     critic_lr: float = 1e-3
     target_kl: float = 0.03
+    target_kl_end: float = 0.0
     max_grad_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (self.target_kl > 0 and self.target_kl_end >= 0):
+            raise ConfigError(
+                f"target_kl is above 0 and target_kl_end not below it, 0 for the same; "
+                f"not {self.target_kl} and {self.target_kl_end}"
+            )
+
+    def aim(self, share: float) -> float:
+        """The divergence aimed at when a share of all samples is done: from one end to the other geometrically."""
+        return self.target_kl * ((self.target_kl_end or self.target_kl) / self.target_kl) ** share
 
 
 class Optimizers:
@@ -81,8 +95,10 @@ def update(
     *,
     generator: torch.Generator,
     train_actor: bool = True,
+    share: float = 0.0,
 ) -> dict[str, float]:
-    """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics.
+    """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics. share: of all
+    samples, what is done.
 
     Raises FloatingPointError before any parameter moves by a loss that is not finite.
     """
@@ -116,7 +132,7 @@ def update(
             if train_actor:
                 nn.utils.clip_grad_norm_(optimizers.parameters, config.max_grad_norm)
                 optimizers.actor.step()
-                optimizers.adapt(float(means["kl"]), config.target_kl)
+                optimizers.adapt(float(means["kl"]), config.aim(share))
             for name, value in means.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value
             steps += 1

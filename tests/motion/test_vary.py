@@ -55,6 +55,15 @@ def test_a_walk_goes_over_into_standing_without_turning_there(walk, humanoid):
     assert low.min() > -1e-3 and low.max() < 0.03
 
 
+def test_a_shorter_change_halts_more_often(walk):
+    def halts(change: float) -> int:
+        varied = vary(walk, turn=0, into=standing(walk), change=change)
+        speed = np.linalg.norm(np.diff(varied.qpos[:, :2], axis=0), axis=1)
+        return int((np.diff((speed * FPS < 0.05).astype(int)) == 1).sum())
+
+    assert halts(1.0) > 2 * halts(3.0) > 0
+
+
 def test_a_walk_halts_with_both_feet_on_the_floor(walk, humanoid):
     varied = vary(walk, seconds=40, turn=0, tempo=1, halt=2)
     motion = kinematics(humanoid, varied.qpos, FPS)
@@ -82,7 +91,7 @@ def test_a_clip_that_is_no_loop_ends_where_it_ends(humanoid):
 def test_what_is_refused(humanoid):
     with pytest.raises(ValueError, match=r"no moment to halt at: its fastest foot never moves slower than 1.00 m/s"):
         vary(glide(humanoid), halt=2)
-    with pytest.raises(ValueError, match=r"tempo at least 1; not 60.0, 60.0, 0.0, 0.5"):
+    with pytest.raises(ValueError, match=r"tempo at least 1, change at least 0.5; not 60.0, 60.0, 0.0, 0.5, 3.0"):
         vary(glide(humanoid), tempo=0.5)
 
 

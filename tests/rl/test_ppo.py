@@ -7,6 +7,7 @@ import pytest
 import torch
 from toy import Aim, Line
 
+from kinetok.config import ConfigError
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import Optimizers, PPOConfig, surrogate, update
@@ -103,6 +104,19 @@ def test_the_rate_follows_the_kl():
     for _ in range(60):
         optimizers.adapt(kl=1.0, target=0.01)
     assert optimizers.lr == 1e-5
+
+
+def test_the_divergence_aimed_at_falls_geometrically():
+    config = replace(CONFIG, target_kl=0.02, target_kl_end=0.005)
+    assert [config.aim(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([0.02, 0.01, 0.005])
+    assert replace(CONFIG, target_kl=0.02).aim(1.0) == 0.02
+    rates = []
+    for share in (0.0, 1.0):
+        trial = Trial(replace(CONFIG, target_kl=1e9, target_kl_end=1e-9))
+        rates.append(trial.learn(share=share)[1]["lr"])
+    assert rates[0] > CONFIG.lr > rates[1]
+    with pytest.raises(ConfigError, match=r"not 0.0 and 0.1"):
+        PPOConfig(target_kl=0.0, target_kl_end=0.1)
 
 
 def test_optimizers_resume():
