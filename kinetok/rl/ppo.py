@@ -47,9 +47,9 @@ class PPOConfig:
                 f"not {self.target_kl} and {self.target_kl_end}"
             )
 
-    def aim(self, share: float) -> float:
-        """The divergence aimed at when a share of all samples is done: from one end to the other geometrically."""
-        return self.target_kl * ((self.target_kl_end or self.target_kl) / self.target_kl) ** share
+    def aim(self, done: float) -> float:
+        """The divergence aimed at when a share of the training is done: from one end to the other geometrically."""
+        return self.target_kl * ((self.target_kl_end or self.target_kl) / self.target_kl) ** done
 
 
 class Optimizers:
@@ -95,10 +95,10 @@ def update(
     *,
     generator: torch.Generator,
     train_actor: bool = True,
-    share: float = 0.0,
+    done: float = 0.0,
 ) -> dict[str, float]:
-    """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics. share: of all
-    samples, what is done.
+    """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics. done: the
+    share of the training that is.
 
     Raises FloatingPointError before any parameter moves by a loss that is not finite.
     """
@@ -132,7 +132,7 @@ def update(
             if train_actor:
                 nn.utils.clip_grad_norm_(optimizers.parameters, config.max_grad_norm)
                 optimizers.actor.step()
-                optimizers.adapt(float(means["kl"]), config.aim(share))
+                optimizers.adapt(float(means["kl"]), config.aim(done))
             for name, value in means.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value
             steps += 1
