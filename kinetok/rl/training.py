@@ -108,8 +108,8 @@ class Training:
         with Logger(self.out, total=samples, title=title, start=start, stride=per_iteration, quiet=quiet) as log:
             obs = torch.from_numpy(self.world.reset(spread=True))
             while progress.samples < samples and not finished(progress):
-                share = min(progress.samples / samples, 1.0)
-                schedule(share)
+                done = min(progress.samples / samples, 1.0)
+                schedule(done)
                 rollout = collect(
                     self.world, self.policy, self.critic, obs, horizon=self.config.horizon, generator=self.generator
                 )
@@ -117,7 +117,7 @@ class Training:
                 first = progress.iteration == 0
                 with self._stopping(rollout):
                     train_actor = progress.iteration > critic_warmup
-                    metrics = {} if first else self.learn(rollout, share, train_actor=train_actor)
+                    metrics = {} if first else self.learn(rollout, done, train_actor=train_actor)
                     if not (first and warm):
                         self.policy.observe(rollout.obs)
                     self.critic.observe(rollout.obs)
@@ -140,8 +140,8 @@ class Training:
                     obs = torch.from_numpy(self.world.reset(spread=True))
         return progress
 
-    def learn(self, rollout: Rollout, share: float, *, train_actor: bool = True) -> dict[str, float]:
-        """One PPO update when a share of the samples is done; FloatingPointError when anything is not finite."""
+    def learn(self, rollout: Rollout, done: float, *, train_actor: bool = True) -> dict[str, float]:
+        """One PPO update when a share of the training is done; FloatingPointError when anything is not finite."""
         config = self.config
         advantages, targets = gae(
             rollout.rewards, rollout.values, rollout.next_values, rollout.done, config.gamma, config.lam
@@ -156,7 +156,7 @@ class Training:
             config,
             generator=self.generator,
             train_actor=train_actor,
-            share=share,
+            done=done,
         )
         # The last minibatch's gradient has no later loss that would show it.
         finite = [torch.isfinite(p).all() for p in (*self.optimizers.parameters, *self.critic.parameters())]

@@ -108,12 +108,12 @@ def test_the_rate_follows_the_kl():
 
 def test_the_divergence_aimed_at_falls_geometrically():
     config = replace(CONFIG, target_kl=0.02, target_kl_end=0.005)
-    assert [config.aim(share) for share in (0.0, 0.5, 1.0)] == pytest.approx([0.02, 0.01, 0.005])
+    assert [config.aim(done) for done in (0.0, 0.5, 1.0)] == pytest.approx([0.02, 0.01, 0.005])
     assert replace(CONFIG, target_kl=0.02).aim(1.0) == 0.02
     rates = []
-    for share in (0.0, 1.0):
-        trial = Trial(replace(CONFIG, target_kl=1e9, target_kl_end=1e-9))
-        rates.append(trial.learn(share=share)[1]["lr"])
+    for done in (0.0, 1.0):
+        trial = Trial(replace(CONFIG, target_kl=10.0, target_kl_end=1e-9))
+        rates.append(trial.learn(done=done)[1]["lr"])
     assert rates[0] > CONFIG.lr > rates[1]
     with pytest.raises(ConfigError, match=r"not 0.0 and 0.1"):
         PPOConfig(target_kl=0.0, target_kl_end=0.1)
