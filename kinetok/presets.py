@@ -89,21 +89,25 @@ def robust() -> FitConfig:
     )  # fmt: skip
 
 
-def acrobat() -> FitConfig:
-    """A continuous expert of leaps, flips and dances, by PPO from one that can walk and run.
+def experts() -> FitConfig:
+    """An expert for each motion, leaps and flips among them, that begins as the packaged teacher; then their student.
 
-    Half a metre from its place it goes on all the same: who is stopped there never learns to land (docs/log.md).
+    Half a metre from its place an episode goes on all the same: who is stopped there never learns to land
+    (docs/log.md, "An expert for each motion").
     """
+    many = many_clips()
     return replace(
-        generalist(),
-        stages=("ppo",),
-        ppo=PPOStage(
-            samples=6_000_000, eval_every=500_000, eval_episodes=8, critic_warmup=10, log_std=(-2.3, -2.9),
-            failure=Failure(largest=1.2, mean=0.6),
-            reward=TrackingReward(position=(0.5, -20.0), height=(0.2, -20.0)),
-            env=EnvConfig(reset_noise=0.01),
+        many,
+        stages=("teacher", "distill"),
+        teacher_tokenizer=generalist().tokenizer,
+        teacher_start="humanoid-teacher",
+        teacher=PPOStage(
+            samples=3_000_000, eval_every=250_000, eval_episodes=16, stop_success=1.0, stop_mpjpe_mm=40.0, patience=4,
+            critic_warmup=10, log_std=(-2.3, -2.9), failure=Failure(largest=1.2, mean=0.6),
+            reward=TrackingReward(position=(0.5, -40.0), height=(0.2, -40.0)), env=EnvConfig(reset_noise=0.01),
             ppo=PPOConfig(lr=1e-5),
         ),
+        distill=replace(many.distill, failure=Failure(largest=0.8, mean=0.45, slack=0.5), focus=6.0),
     )  # fmt: skip
 
 
@@ -145,7 +149,7 @@ FIT = {
     "many-clips": many_clips,
     "generalist": generalist,
     "robust": robust,
-    "acrobat": acrobat,
+    "experts": experts,
     "from-scratch": from_scratch,
     "tiny": tiny,
 }

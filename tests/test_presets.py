@@ -40,7 +40,7 @@ def test_a_misspelt_key_names_the_nearest(build):
 def test_the_student_has_tokens_unless_it_is_a_teacher(name):
     config = presets.FIT[name]()
     quantizer = config.tokenizer.quantizer
-    if name in ("generalist", "robust", "acrobat"):
+    if name in ("generalist", "robust"):
         assert quantizer.kind == "continuous" and "teacher" not in config.stages
     else:
         layout = TokenLayout.grouped(quantizer.dim, quantizer.levels, config.tokenizer.scalars)

@@ -21,7 +21,7 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
     \b
     Presets: one-clip (minutes), many-clips (hours), generalist (one teacher
     for many), robust (a teacher that withstands pushes, from another one),
-    acrobat (one of flips and dances, from another one),
+    experts (one for each clip, from the packaged teacher),
     from-scratch (end-to-end PPO alone), tiny (tests).
     Examples: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
     kinetok tokenize fit --clips walk.txt --out runs/robust --preset robust --set start=humanoid-teacher
