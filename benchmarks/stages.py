@@ -48,7 +48,9 @@ def stages(clips: list[Clip], runs: Path, *, preset: str, episodes: int, seed: i
     """Train what is not trained yet, then score each stage on all clips; a teacher on its own clip, averaged."""
     chain, scratch = runs / "chain", runs / "scratch"
     fit(clips, replace(FIT[preset](), stages=STAGES), chain, seed=seed, threads=threads)
-    config = replace(FIT["from-scratch"](), tokenizer=FIT[preset]().tokenizer)
+    config, tokenizer = FIT["from-scratch"](), FIT[preset]().tokenizer
+    unit = replace(tokenizer.quantizer, unit=True)
+    config = replace(config, tokenizer=replace(tokenizer, quantizer=unit))
     fit(clips, config, scratch, seed=seed, threads=threads)
     table = {}
     teachers = [chain / "teachers" / clip.name for clip in clips]
