@@ -16,6 +16,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+from kinetok.config import override
 from kinetok.evaluate import evaluate_tracking
 from kinetok.logger import read_metrics
 from kinetok.motion.clip import Clip
@@ -48,9 +49,8 @@ def stages(clips: list[Clip], runs: Path, *, preset: str, episodes: int, seed: i
     """Train what is not trained yet, then score each stage on all clips; a teacher on its own clip, averaged."""
     chain, scratch = runs / "chain", runs / "scratch"
     fit(clips, replace(FIT[preset](), stages=STAGES), chain, seed=seed, threads=threads)
-    config, tokenizer = FIT["from-scratch"](), FIT[preset]().tokenizer
-    unit = replace(tokenizer.quantizer, unit=True)
-    config = replace(config, tokenizer=replace(tokenizer, quantizer=unit))
+    config = replace(FIT["from-scratch"](), tokenizer=FIT[preset]().tokenizer)
+    config = override(config, ["tokenizer.quantizer.unit=true"])
     fit(clips, config, scratch, seed=seed, threads=threads)
     table = {}
     teachers = [chain / "teachers" / clip.name for clip in clips]
@@ -67,7 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="+", type=Path)
     parser.add_argument("--runs", type=Path, required=True, help="folder of the trainings; gone on with if it is there")
-    parser.add_argument("--preset", default="one-clip", choices=[name for name in FIT if name != "from-scratch"])
+    parser.add_argument("--preset", default="one-clip", choices=["one-clip", "many-clips", "tiny"])
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=0)
