@@ -175,7 +175,7 @@ def save_state(path: Path | str, tensors: Tensors, meta: dict[str, Any]) -> None
 
 
 def load_state(path: Path | str) -> tuple[Tensors, dict[str, Any]]:
-    """The tensors (on the CPU) and meta that `save_state` wrote."""
+    """The tensors, on torch's default device, and meta that `save_state` wrote."""
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; there is no state to resume from")
@@ -348,7 +348,7 @@ def _refuse_newer(path: Path, version: str) -> None:
 
 def _read_tensors(path: Path) -> tuple[Tensors, dict[str, str]]:
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(path, "pt", device=str(torch.get_default_device())) as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except SafetensorError as error:
         raise CheckpointError(f"{path} is not a safetensors file ({error}); copy or save it again") from error

@@ -31,6 +31,7 @@ from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.library import ClipLibrary
+from kinetok.rl.rollout import seeded
 from kinetok.sim.tasks import TASKS
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -110,7 +111,7 @@ class _Listener:
         if not self._codes:
             return {}
         layout = self._tokenizer.layout
-        return _usage(layout.to_tokens(torch.cat(self._codes)).numpy(), layout.vocabulary)
+        return _usage(layout.to_tokens(torch.cat(self._codes)).numpy(force=True), layout.vocabulary)
 
 
 def evaluate_prior(
@@ -198,7 +199,7 @@ def evaluate_task(
             raise ConfigError(f"{adapter} was bent to {config.kind!r} and cannot read what {task!r} asks")
     else:
         model, config = Prior.from_pretrained(prior or "humanoid-gpt", tokenizer), TASKS[task or "target"][0]()
-        controller = _blind(PriorController(model, generator=torch.Generator().manual_seed(seed), **drawn))
+        controller = _blind(PriorController(model, generator=seeded(seed), **drawn))
     played = play(controller, config, model, episodes=episodes, seconds=seconds, push=push, seed=seed, threads=threads)
     return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed} | drawn
 

@@ -53,7 +53,7 @@ class State:
         for name, part in self.parts.items():
             before = tree.pop(name)
             if isinstance(part, torch.Generator):
-                part.set_state(before)
+                part.set_state(before.cpu())
             else:
                 part.load_state_dict(before)
         return meta, tree

@@ -24,7 +24,7 @@ BELOW = {
 }
 PURE = {
     "tokenizers": {"quantizer", "fsq", "vq", "rvq", "categorical", "gaussian", "spherical", "layout"},
-    "gpt": {"model", "cache", "sample"},
+    "gpt": {"model", "cache", "replay", "sample"},
     "adapters": {"lora", "dora", "cola", "full", "inject"},
 }
 OUTSIDE = {"torch", "numpy", "einops"}

@@ -38,7 +38,7 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.rl.training import Training
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks import TASKS, GoalConfig, TargetConfig
@@ -120,7 +120,7 @@ class Skill:
 
     def controller(self, seed: int | None = 0) -> Controller:
         """Observations of the task to PD targets; seed None takes the most probable tokens."""
-        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        generator = None if seed is None else seeded(seed)
         return TokenPolicy(self.adapted, self.prior.tokenizer, self.policy).controller(generator)
 
     def save_pretrained(self, path: Path | str, card: str | None = None, parents: dict[str, str] | None = None) -> None:
@@ -343,7 +343,7 @@ def _look_back(
 def _judge(policy: TokenPolicy, skill: Skill, config: FinetuneConfig, seed: int, threads: int) -> TaskScore:
     """What chooses the best of a run: the same episodes every time, which no `evaluate task` asks for."""
     played = play(
-        policy.controller(torch.Generator().manual_seed(seed + JUDGE)),
+        policy.controller(seeded(seed + JUDGE)),
         config.task,
         skill.prior,
         episodes=config.eval_episodes,

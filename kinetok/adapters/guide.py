@@ -106,14 +106,14 @@ def demonstrate(
             there = place.seen(body)
             asking = goal.observe(there)[:, asked]
             task.wish[:] = forwards(goal.wish(asking))
-            seen = torch.from_numpy(obs)
+            seen = torch.as_tensor(obs)
             codes = tokenizer.encode(seen)
-            states[t], c[t], tokens[t] = seen[:, part], torch.from_numpy(asking), layout.to_tokens(codes)
+            states[t], c[t], tokens[t] = seen[:, part], torch.as_tensor(asking), layout.to_tokens(codes)
             played = jitter(codes, code_noise, tokenizer.quantizer.levels[0], rng) if code_noise else codes
             action = tokenizer.decode(played, seen[:, part])
             if driver is not None:
                 action[::2] = driver(torch.cat([states[t], c[t]], 1)[::2])
-            step = world.step(action.numpy())
+            step = world.step(action.numpy(force=True))
             terminated[t], obs = step.terminated, step.obs
             done[t, step.done] = True
             # A row that ended begins anew where it was; one that lands has come to where its body is now.
@@ -130,5 +130,5 @@ def demonstrate(
             goal.over(place.seen(body))
             if t % 20 == 19 or t == steps - 1:
                 log.write((t + 1) * rows - 1, world.episode_metrics())
-    kept = torch.from_numpy(~before_failure(terminated, done, round(doomed * scene.control_hz)))
+    kept = torch.as_tensor(~before_failure(terminated, done, round(doomed * scene.control_hz)))
     return states[kept], c[kept], tokens[kept]

@@ -34,7 +34,7 @@ from kinetok.config import to_dict
 from kinetok.gpt.data import Rollout, before_failure, roam
 from kinetok.logger import Logger
 from kinetok.resume import State
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.rl.training import Score
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks import Goal
@@ -95,7 +95,7 @@ def hindsight(
     """
     adapted, best, done = policy.adapted, -1e9, 0
     optimizer = torch.optim.Adam(adapted.trainable(), lr=config.lr, fused=True)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     parts = {"adapted": AdapterPart(adapted), "optimizer": optimizer, "generator": generator}
     state = State(out, parts, identity=identity | {"stage": to_dict(config)}, kinds={"stage": HindsightConfig})
     memory: list[tuple[Tensor, ...]] = []
@@ -151,15 +151,15 @@ def play_on(policy: TokenPolicy, env: Env, config: HindsightConfig, generator: t
     """`seconds` of the policy in every row."""
     steps = round(config.seconds * env.config.scene.control_hz)
     played = Rollout.empty(steps, env.rows, policy.state_dim, policy.tokens.tokens_per_step)
-    obs = torch.from_numpy(env.reset())
+    obs = torch.as_tensor(env.reset())
     with torch.no_grad(), torch_threads(1):
         for t in range(steps):
             played.root[t] = env.sim.qpos[:, :7]
             action, taken = policy.draw(obs, generator)
             played.states[t], played.tokens[t] = obs[:, : policy.state_dim], taken["tokens"]
-            step = env.step(action.numpy())
+            step = env.step(action.numpy(force=True))
             played.terminated[t], played.cut[t, step.done] = step.terminated, True
-            obs = torch.from_numpy(step.obs)
+            obs = torch.as_tensor(step.obs)
     env.episode_metrics()
     return played
 
@@ -204,14 +204,14 @@ def relabel(rolled: Rollout, env: Env, config: HindsightConfig, seed: int) -> tu
     ends = np.minimum(np.take_along_axis(ends, last, 0), len(cut) - 1)
     heading = rotation.heading(rolled.root[..., 3:])
     c, told = env.task.hindsight(rolled.root[..., :2], heading, ends, np.random.default_rng(seed))
-    keep = torch.from_numpy(good & told)
+    keep = torch.as_tensor(good & told)
     if not keep.any():
         raise ValueError(
             f"in {cut.size} control steps nothing came true that the task could have asked for; "
             "play longer (hindsight.seconds, hindsight.samples), or look at the prior with `kinetok evaluate prior`"
         )
-    fulfilled = torch.from_numpy(c)[keep]
-    asked = torch.from_numpy(env.reset()[:, env.task.layout["task"]])
+    fulfilled = torch.as_tensor(c)[keep]
+    asked = torch.as_tensor(env.reset()[:, env.task.layout["task"]])
     return rolled.states[keep], fulfilled, rolled.tokens[keep], balance(fulfilled, asked, config)
 
 

@@ -71,17 +71,46 @@ def draw(
     generator: source of the uniform numbers; needed unless `greedy`, which takes the most probable option left.
     top_p: mass of the base's nucleus; 1 keeps every option. caches: of `new_caches(adapted, N)`.
     """
-    _check(adapted, temperature)
+    rows = len(state)
     if generator is None and not greedy:
         raise ValueError("drawing needs generator=torch.Generator(...); or pass greedy=True")
-    base, rows = adapted.base, len(state)
-    for_base, for_bent = caches or new_caches(adapted, rows)
-    if for_base.rows != rows:
+    caches = caches or new_caches(adapted, rows)
+    if caches[0].rows != rows:
         raise ValueError(
-            f"the caches hold {for_base.rows} rows and the state has {rows}; make new_caches(adapted, {rows})"
+            f"the caches hold {caches[0].rows} rows and the state has {rows}; make new_caches(adapted, {rows})"
         )
+    uniform = None if greedy or generator is None else uniforms(adapted, rows, generator)
+    tokens, keep, log_prob = choose(
+        adapted, caches, state, c, uniform, top_p=top_p, temperature=temperature, guidance=guidance
+    )
+    return Drawn(tokens=tokens, keep=keep, log_prob=log_prob)
+
+
+def uniforms(adapted: Adapted, rows: int, generator: torch.Generator) -> Tensor:
+    """What `choose` draws by: a number in [0, 1) for every choice of a control step, (rows, S, D)."""
+    shape = rows, adapted.base.config.tokens_per_step, adapted.base.head.choices
+    return torch.rand(shape, generator=generator, device=generator.device)
+
+
+@torch.no_grad()
+def choose(
+    adapted: Adapted,
+    caches: tuple[KVCache, KVCache],
+    state: Tensor,
+    c: Tensor | None,
+    uniform: Tensor | None,
+    *,
+    top_p: float,
+    temperature: float,
+    guidance: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """tokens, keep and log_prob of a `Drawn`, given the numbers it is drawn by, None for the most probable options.
+
+    Looks at no tensor's value, so that a GPU can replay it."""
+    _check(adapted, temperature)
+    base, rows = adapted.base, len(state)
+    for_base, for_bent = caches
     steps, choices, options = base.config.tokens_per_step, base.head.choices, base.head.options
-    uniform = None if greedy else torch.rand(rows, steps, choices, generator=generator, device=state.device)
     tokens = torch.empty(rows, steps, dtype=torch.int64, device=state.device)
     keep = torch.empty(rows, steps, choices, options, dtype=torch.bool, device=state.device)
     log_prob = torch.zeros(rows, steps, dtype=state.dtype, device=state.device)
@@ -98,7 +127,7 @@ def draw(
             keep[:, j, d], token = kept, token * options + chosen
             x, y = base.head.push(x, d, chosen), adapted.head.push(y, d, chosen)
         tokens[:, j] = token
-    return Drawn(tokens=tokens, keep=keep, log_prob=log_prob)
+    return tokens, keep, log_prob
 
 
 def score(

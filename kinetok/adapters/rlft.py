@@ -18,10 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from kinetok.adapters.adapted import Adapted
-from kinetok.adapters.policy import draw, new_caches, score
+from kinetok.adapters.policy import choose, new_caches, score, uniforms
 from kinetok.config import ConfigError
 from kinetok.gpt.controller import Prior
 from kinetok.gpt.data import Starts
+from kinetok.gpt.replay import Replay
 from kinetok.rl.policy import Assessment
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
@@ -66,26 +67,27 @@ class TokenPolicy:
         self.adapted, self.tokenizer, self.config = adapted, tokenizer, config
         self.anchor, self.pull = anchor, pull
         self.tokens, self.state_dim = tokenizer.layout, adapted.base.config.state_dim
-        self._caches = new_caches(adapted, 1)
+        self._players: dict[tuple[int, bool], Callable[..., tuple[Tensor, ...]]] = {}
 
     def draw(self, obs: Tensor, generator: torch.Generator | None) -> tuple[Tensor, dict[str, Tensor]]:
         """PD targets (N, nu) and the tokens behind them; without a generator the most probable ones."""
-        if self._caches[0].rows != len(obs):
-            self._caches = new_caches(self.adapted, len(obs))
-        state, c = self._parts(obs)
-        drawn = draw(
-            self.adapted,
-            state,
-            c,
-            generator=generator,
-            top_p=self.config.top_p,
-            temperature=self.config.temperature,
-            guidance=self.config.guidance,
-            greedy=generator is None,
-            caches=self._caches,
-        )
-        action = self.tokenizer.decode(self.tokens.to_codes(drawn.tokens), state)
-        return action, {"tokens": drawn.tokens, "keep": drawn.keep, "log_prob": drawn.log_prob.sum(-1)}
+        key = len(obs), generator is None
+        if key not in self._players:
+            self._players[key] = self._player(*key, replayed=obs.device.type == "cuda")
+        given = () if generator is None else (uniforms(self.adapted, len(obs), generator),)
+        tokens, keep, log_prob = self._players[key](obs, *given)
+        action = self.tokenizer.decode(self.tokens.to_codes(tokens), obs[:, : self.state_dim])
+        return action, {"tokens": tokens, "keep": keep, "log_prob": log_prob.sum(-1)}
+
+    def _player(self, rows: int, greedy: bool, *, replayed: bool) -> Callable[..., tuple[Tensor, ...]]:
+        """tokens, keep, log_prob of observations (rows, O), and of the numbers to draw by unless `greedy`."""
+        config, caches = self.config, new_caches(self.adapted, rows)
+
+        def play(obs: Tensor, uniform: Tensor | None = None) -> tuple[Tensor, ...]:
+            how = {"top_p": config.top_p, "temperature": config.temperature, "guidance": config.guidance}
+            return choose(self.adapted, caches, *self._parts(obs), uniform, **how)
+
+        return Replay(play) if replayed else play
 
     def assess(self, obs: Tensor, taken: dict[str, Tensor]) -> Assessment:
         config, (state, c) = self.config, self._parts(obs)
@@ -207,7 +209,7 @@ def play(
             if record:
                 qpos.append(env.sim.qpos[:record].copy())
                 markers.append(task.markers(0))
-            step = env.step(controller(torch.from_numpy(obs)).numpy())
+            step = env.step(controller(torch.as_tensor(obs)).numpy(force=True))
             body = env.sim.state()
             head = {"head_height_m": body.pos[:, heads[0], 2]} if heads else {}
             card.add(step.reward, step.terminated, task.measure(body) | head)

@@ -26,6 +26,7 @@ from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.resume import State
+from kinetok.rl.rollout import seeded
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -84,7 +85,7 @@ def supervise(
     step, best = 0, {"held_out/cross_entropy": math.inf}
     parameters = [p for p in adapted.gpt.parameters() if p.requires_grad]  # all but the nets that read c
     optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     torch.manual_seed(seed)  # dropout's
     parts = {"optimizer": optimizer, "generator": generator, "dropout": torch.default_generator}
     state = State(out, {"adapter": AdapterPart(adapted), **parts}, identity=identity, kinds={"sft": SFTConfig})

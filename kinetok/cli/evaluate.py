@@ -2,7 +2,16 @@
 
 import click
 
-from kinetok.cli.shared import PATHS, TASK_NAMES, Chain, load_clips, option_seed, option_threads, show_json
+from kinetok.cli.shared import (
+    PATHS,
+    TASK_NAMES,
+    Chain,
+    load_clips,
+    option_device,
+    option_seed,
+    option_threads,
+    show_json,
+)
 
 
 @click.group(cls=Chain)
@@ -24,6 +33,7 @@ def evaluate() -> None:
     help="Begin loops at their first frame alone, as papers do.",
 )
 @option_threads
+@option_device
 @option_seed
 def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads, seed) -> None:
     """Success rate and MPJPE of a tokenizer (or a teacher) on clips, by clip and overall."""
@@ -52,6 +62,7 @@ def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads
 @click.option("--push", default=0.0, help="Push every character once, at step 200, by so many m/s.")
 @click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
 @option_threads
+@option_device
 @option_seed
 def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, threads, seed) -> None:
     """Survival, diversity and smoothness of motion sampled from a prior, from random reference states."""
@@ -78,6 +89,7 @@ def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, thread
 )
 @click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
 @option_threads
+@option_device
 @option_seed
 def evaluate_task(
     adapter, prior, tokenizer, task, out, episodes, seconds, push, top_p, temperature, threads, seed

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from kinetok.cli.shared import PATHS, check_suffix, option_seed, show_json, write_motion
+from kinetok.cli.shared import PATHS, check_suffix, option_device, option_seed, show_json, write_motion
 
 
 @click.command()
@@ -20,6 +20,7 @@ from kinetok.cli.shared import PATHS, check_suffix, option_seed, show_json, writ
 @click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
 @click.option("--push", default=0.0, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds.")
 @option_seed
+@option_device
 def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
     """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics).
 

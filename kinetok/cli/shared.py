@@ -41,11 +41,40 @@ option_threads = click.option(
 )
 
 
+def _use_device(_: click.Context, __: click.Parameter, name: str) -> None:
+    """Make the networks' device torch's default, for this process; the CPU needs no torch yet."""
+    if name == "cpu":
+        return
+    import torch
+
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:  # what torch raises differs from build to build
+        count = torch.cuda.device_count()
+        found = ", ".join(["cpu", *(f"cuda:{k}" for k in range(count))])
+        reason = str(error).splitlines()[0]
+        raise click.BadParameter(
+            f"torch cannot use {name!r} ({reason}); here there is {found}. A GPU needs a build of torch for it"
+        ) from error
+    torch.set_default_device(name)
+
+
+option_device = click.option(
+    "--device",
+    default="cpu",
+    show_default=True,
+    metavar="NAME",
+    callback=_use_device,
+    expose_value=False,
+    help="Where the networks are: cpu, cuda, cuda:1. Physics stays on the cores (docs/gpu.md).",
+)
+
+
 def configured(presets: str):
-    """--preset, --set, --seed and --threads, the same on every training command."""
+    """--preset, --set, --seed, --threads and --device, the same on every training command."""
 
     def decorate(command):
-        command = option_seed(option_threads(command))
+        command = option_seed(option_threads(option_device(command)))
         command = click.option(
             "--set",
             "settings",

@@ -24,7 +24,7 @@ from kinetok.gpt.data import Starts
 from kinetok.gpt.model import GPT, GPTConfig
 from kinetok.gpt.sample import sample
 from kinetok.motion.character import Character
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.free import Free
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -188,7 +188,7 @@ def roll(
     task = Free(body, prior.starts.qpos, prior.starts.qvel, rows=rows, starts=starts)
     config = EnvConfig(scene=prior.tokenizer.config.scene, episode_seconds=seconds + 1)
     env = Env(config, task, rows=rows, threads=threads, seed=seed)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     controller = PriorController(prior, top_p=top_p, temperature=temperature, generator=generator)
     angle = np.random.default_rng([seed, 1]).uniform(0, 2 * np.pi, rows)
     impulse = push * np.stack([np.cos(angle), np.sin(angle), np.zeros(rows)], axis=1)
@@ -202,9 +202,9 @@ def roll(
             qpos[t], pos[t] = env.sim.qpos, env.sim.state().pos
             if push and t == push_at:
                 env.sim.add_velocity(np.arange(rows), impulse)
-            action, chosen = controller.act(torch.from_numpy(obs))
-            tokens[t] = chosen.numpy()
-            step = env.step(action.numpy())
+            action, chosen = controller.act(torch.as_tensor(obs))
+            tokens[t] = chosen.numpy(force=True)
+            step = env.step(action.numpy(force=True))
             blown_up |= step.terminated
             obs = step.obs
     return Recording(

@@ -53,7 +53,7 @@ class Starts:
 
     @classmethod
     def of(cls, tensors: dict[str, Tensor], prefix: str = "starts.") -> "Starts":
-        return cls(**{name: tensors[prefix + name].numpy() for name in ("qpos", "qvel", "clip")})
+        return cls(**{name: tensors[prefix + name].numpy(force=True) for name in ("qpos", "qvel", "clip")})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,7 +115,7 @@ def draw_starts(table: ReferenceTable, count: int, rng: np.random.Generator) -> 
 def jitter(codes: Tensor, share: float, levels: int, rng: np.random.Generator) -> Tensor:
     """Codes (N, D) of which a `share` is moved up or down by one level, within 0 .. levels - 1."""
     shift = np.where(rng.random(codes.shape) < share, rng.choice([-1, 1], codes.shape), 0)
-    return (codes + torch.from_numpy(shift)).clamp(0, levels - 1)
+    return (codes + torch.as_tensor(shift)).clamp(0, levels - 1)
 
 
 def before_failure(terminated: np.ndarray, done: np.ndarray, steps: int) -> np.ndarray:
@@ -195,12 +195,12 @@ def roam(
                 new = np.flatnonzero((t == 0) | (rng.random(rows) < 1 / (wander * scene.control_hz)))
                 first, cycle = table.first[task.clip[new]], table.cycle[task.clip[new]]
                 task.wish[new] = task.second[first + (rng.random(len(new)) * cycle).astype(int)]
-            seen = torch.from_numpy(obs)
+            seen = torch.as_tensor(obs)
             codes = tokenizer.encode(seen)
             rolled.states[t], rolled.tokens[t] = seen[:, part], layout.to_tokens(codes)
             rolled.root[t], rolled.clip[t] = world.sim.qpos[:, :7], task.clip
             played = jitter(codes, code_noise, tokenizer.quantizer.levels[0], rng) if code_noise else codes
-            step = world.step(tokenizer.decode(played, seen[:, part]).numpy())
+            step = world.step(tokenizer.decode(played, seen[:, part]).numpy(force=True))
             rolled.terminated[t], obs = step.terminated, step.obs
             rolled.cut[t] = step.terminated | step.truncated | (task.landing >= 0)
             task.land(world, obs)
@@ -234,7 +234,7 @@ def record(
         for i, w in enumerate(shares)
     ]
     steps = round(BEFORE_FAILURE * tokenizer.config.scene.control_hz)
-    good = [torch.from_numpy(~before_failure(part.terminated, part.cut, steps)) for part in parts]
+    good = [torch.as_tensor(~before_failure(part.terminated, part.cut, steps)) for part in parts]
     if not torch.cat(good).any():
         raise ValueError(
             f"the tokenizer follows none of {', '.join(table.names)} for more than {BEFORE_FAILURE} s, so there is "
@@ -244,7 +244,7 @@ def record(
     return TokenDataset(
         states=torch.cat([part.states[kept] for part, kept in zip(parts, good, strict=True)]),
         tokens=torch.cat([part.tokens[kept] for part, kept in zip(parts, good, strict=True)]),
-        clip=torch.cat([torch.from_numpy(part.clip)[kept] for part, kept in zip(parts, good, strict=True)]),
+        clip=torch.cat([torch.as_tensor(part.clip)[kept] for part, kept in zip(parts, good, strict=True)]),
         world=torch.cat([world[kept] for world, kept in zip(worlds, good, strict=True)]),
         names=tuple(table.names),
         starts=draw_starts(table, STARTS, np.random.default_rng([seed, 2])),

@@ -34,7 +34,7 @@ from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.resume import State
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.roaming import REACH
 from kinetok.sim.tasks.tracking import ReferenceTable
@@ -186,7 +186,7 @@ def train(
     """
     average = copy.deepcopy(gpt).eval().requires_grad_(False)
     optimizer = _optimizer(gpt, config)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     learn, hold = data.split(config.held_out)
     hold = hold[torch.linspace(0, len(hold) - 1, min(len(hold), EVAL_SAMPLES)).long()] if len(hold) else hold
     step, best = 0, {"held_out/cross_entropy": math.inf}

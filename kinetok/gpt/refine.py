@@ -25,7 +25,7 @@ from kinetok.gpt.data import TokenDataset
 from kinetok.gpt.model import GPT
 from kinetok.logger import Logger
 from kinetok.resume import State
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.free import Free
 
@@ -77,7 +77,7 @@ def refine(
     average = copy.deepcopy(prior.gpt).eval().requires_grad_(False)
     playing = replace(prior, gpt=average)
     optimizer = torch.optim.AdamW(gpt.parameters(), lr=config.lr, betas=(0.9, 0.95), weight_decay=0.01, fused=True)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     parts = {"gpt": gpt, "average": average, "optimizer": optimizer, "generator": generator}
     state = State(out, parts, identity=identity, kinds={"stage": RefineConfig})
     done, best = 0, -1.0
@@ -138,14 +138,14 @@ def play(
     with torch.no_grad(), torch_threads(1):
         for t in range(steps):
             height[t] = np.where(broken, 0, env.sim.qpos[:, 2])
-            states[t] = torch.from_numpy(obs)
+            states[t] = torch.as_tensor(obs)
             action, chosen = controller.act(states[t])
             tokens[t] = chosen.to(torch.int32)
-            step = env.step(action.numpy())
+            step = env.step(action.numpy(force=True))
             broken |= step.terminated
             obs = step.obs
     good = stayed_up(height, round(config.doomed * prior.fps), round(config.patience * prior.fps))
-    kept = torch.from_numpy(good)
+    kept = torch.as_tensor(good)
     fell = float(((height < DOWN) & np.maximum.accumulate(height > UP, axis=0)).any(0).mean())
     return states[kept], tokens[kept], fell
 

@@ -44,7 +44,8 @@ def nucleus(logits: Tensor, p: float) -> Tensor:
     needed = 1 + (mass[:, :-1] < p).sum(-1, keepdim=True)
     border = top.gather(-1, needed - 1)
     keep = probs >= border
-    if not torch.equal(keep.sum(-1, keepdim=True), needed):
+    # Rare, and dear on a CPU; on a GPU asking whether it is so costs more than doing it.
+    if probs.device.type != "cpu" or not torch.equal(keep.sum(-1, keepdim=True), needed):
         tied = probs == border
         above = (probs > border).sum(-1, keepdim=True)
         keep &= ~tied | (tied.cumsum(-1) <= needed - above)

@@ -112,7 +112,7 @@ def update(
             optimizers.actor.zero_grad(set_to_none=True)
             optimizers.critic.zero_grad(set_to_none=True)
             means: dict[str, Tensor] = {}
-            for ids in minibatch.split(CHUNK):
+            for ids in minibatch.split(CHUNK if obs.device.type == "cpu" else config.minibatch):
                 value_loss = (critic(obs[ids]) - targets[ids]).pow(2).mean()
                 metrics: dict[str, Tensor] = {"value_loss": value_loss}
                 loss = value_loss

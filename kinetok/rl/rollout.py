@@ -3,7 +3,8 @@
     rollout = collect(world, policy, critic, obs, horizon=16, generator=g)
 
 `World` is what `sim.Env` fits by shape. Torch runs on one thread here: the physics threads need the cores, and
-one thread makes the states independent of the thread count.
+one thread makes the states independent of the thread count. Networks and rollouts are on torch's default device,
+worlds in NumPy: observations go over with `torch.as_tensor`, actions come back with `numpy(force=True)`.
 """
 
 from collections.abc import Iterator
@@ -61,6 +62,11 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def seeded(seed: int) -> torch.Generator:
+    """A generator of random numbers on torch's default device, where networks are."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
+
 @torch.no_grad()
 def collect(
     world: World, policy: Policy, critic: Critic, obs: Tensor, *, horizon: int, generator: torch.Generator
@@ -77,13 +83,13 @@ def collect(
         for t in range(horizon):
             action, drawn = policy.draw(all_obs[t], generator)
             taken.append(drawn)
-            step = world.step(action.numpy())
-            all_obs[t + 1] = torch.from_numpy(step.obs)
-            rewards[t] = torch.from_numpy(step.reward)
-            terminal[t] = torch.from_numpy(step.terminated)
+            step = world.step(action.numpy(force=True))
+            all_obs[t + 1] = torch.as_tensor(step.obs)
+            rewards[t] = torch.as_tensor(step.reward)
+            terminal[t] = torch.as_tensor(step.terminated)
             done[t, step.done] = True
             if len(step.done):
-                finals.append((t, step.done, torch.from_numpy(step.final_obs)))
+                finals.append((t, step.done, torch.as_tensor(step.final_obs)))
     values = critic(all_obs.flatten(0, 1)).view(horizon + 1, n)
     next_values = values[1:].clone()
     if finals:

@@ -26,7 +26,7 @@ from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
-from kinetok.rl.rollout import Rollout, World, collect
+from kinetok.rl.rollout import Rollout, World, collect, seeded
 
 
 class Score(Protocol):
@@ -75,7 +75,7 @@ class Training:
     ):
         self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
         self.optimizers = Optimizers(policy, critic, config)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = seeded(seed)
         parts = {"critic": critic, **modules, "optimizers": self.optimizers, "generator": self.generator}
         self._state = State(out, parts, identity=identity, kinds=kinds)
 
@@ -106,7 +106,7 @@ class Training:
         per_iteration = self.world.rows * self.config.horizon
         start = progress.samples + per_iteration
         with Logger(self.out, total=samples, title=title, start=start, stride=per_iteration, quiet=quiet) as log:
-            obs = torch.from_numpy(self.world.reset(spread=True))
+            obs = torch.as_tensor(self.world.reset(spread=True))
             while progress.samples < samples and not finished(progress):
                 done = min(progress.samples / samples, 1.0)
                 schedule(done)
@@ -137,7 +137,7 @@ class Training:
                 if due and (progress.samples - progress.saved >= save_every or progress.samples >= samples):
                     progress.saved = progress.samples
                     self.save(progress)
-                    obs = torch.from_numpy(self.world.reset(spread=True))
+                    obs = torch.as_tensor(self.world.reset(spread=True))
         return progress
 
     def learn(self, rollout: Rollout, done: float, *, train_actor: bool = True) -> dict[str, float]:

@@ -58,7 +58,7 @@ class TokenStream:
         tensors, meta = load_state(path)
         if meta.get("kind") != "tokens":
             raise CheckpointError(f"{path} holds no tokens; write one with `kinetok tokenize encode`")
-        arrays = {name: tensors[name].numpy() for name in ("qpos", "qvel", "simulated")}
+        arrays = {name: tensors[name].numpy(force=True) for name in ("qpos", "qvel", "simulated")}
         return TokenStream(
             tokens=tensors["tokens"],
             layout=from_dict(TokenLayout, meta["layout"]),
@@ -87,7 +87,7 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
     tracking = TrackingConfig(future=config.future, failure=Failure(largest=np.inf, mean=0.5))
     task = Tracking(tracking, table, rows=1, starts=np.zeros(1, dtype=int))
     env = Env(EnvConfig(scene=config.scene, autoreset=False), task, rows=1, threads=1, seed=seed)
-    obs = torch.from_numpy(env.reset())
+    obs = torch.as_tensor(env.reset())
     first = env.sim.qpos[0].copy(), env.sim.qvel[0].copy()
     tokens, simulated = [], [first[0]]
     with torch.no_grad(), torch_threads(1):
@@ -95,8 +95,8 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
             codes = tokenizer.encode(obs)
             action = tokenizer.decode(codes, obs[:, task.layout["state"]])
             tokens.append(layout.to_tokens(codes)[0])
-            step = env.step(action.numpy())
-            obs = torch.from_numpy(step.obs)
+            step = env.step(action.numpy(force=True))
+            obs = torch.as_tensor(step.obs)
             simulated.append(env.sim.qpos[0].copy())
             if step.terminated[0]:
                 break
@@ -133,8 +133,9 @@ def decode_tokens(tokenizer: MotionTokenizer, stream: TokenStream) -> np.ndarray
     codes = stream.layout.to_codes(stream.tokens)
     with torch_threads(1):
         for step in range(len(codes)):
-            state = torch.from_numpy(state_features(sim.state()))
-            if len(sim.step(tokenizer.decode(codes[step : step + 1], state).numpy(), tokenizer.config.scene.substeps)):
+            state = torch.as_tensor(state_features(sim.state()))
+            action = tokenizer.decode(codes[step : step + 1], state)
+            if len(sim.step(action.numpy(force=True), tokenizer.config.scene.substeps)):
                 raise FloatingPointError(f"the simulation blew up at token step {step} of {len(codes)}")
             poses.append(sim.qpos[0].copy())
     return np.array(poses)

@@ -20,7 +20,7 @@ from torch import Tensor
 from kinetok.config import at_least
 from kinetok.logger import Logger
 from kinetok.resume import State
-from kinetok.rl.rollout import torch_threads
+from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.roaming import REACH, Roaming
@@ -105,7 +105,7 @@ def distill(
     flags = mirrored or [False] * len(teachers)
     views = _Views([_View(teacher.eval(), task, flag) for teacher, flag in zip(teachers, flags, strict=True)])
     learner = _View(student, task, False)
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
     identity = identify(config, student.config, table.names, seed) | ({"parents": parents} if parents else {})
     parts = {"student": student, "optimizer": optimizer, "generator": generator}
@@ -125,7 +125,7 @@ def distill(
     total = max(config.samples // config.rows, 1)
     start = (step + 1) * config.rows
     with Logger(out, total=config.samples, title="distill", start=start, stride=config.rows, quiet=quiet) as log:
-        obs = torch.from_numpy(env.reset(spread=True))
+        obs = torch.as_tensor(env.reset(spread=True))
         while step < total:
             with torch.no_grad(), torch_threads(1):
                 action = learner.act(obs)
@@ -136,10 +136,10 @@ def distill(
                 if float(student.norm.count) < 1_000_000:
                     student.observe(learner.seen(obs))
                 action += config.noise * torch.randn(action.shape, generator=generator)
-                seen = env.step(action.numpy()).obs
+                seen = env.step(action.numpy(force=True)).obs
                 if isinstance(task, Roaming):
                     task.land(env, seen)
-                obs = torch.from_numpy(seen)
+                obs = torch.as_tensor(seen)
             for group in optimizer.param_groups:
                 group["lr"] = config.lr + (config.lr_end - config.lr) * step / total
             loss = torch.zeros(())
@@ -166,7 +166,7 @@ def distill(
                 saved = samples
                 told = {"step": step, "score": best and best.to_json(), "env": json.dumps(env.state_dict())}
                 state.save(told)
-                obs = torch.from_numpy(env.reset(spread=True))
+                obs = torch.as_tensor(env.reset(spread=True))
                 filled = cursor = 0
     student.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())
     return best or track(student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
@@ -205,7 +205,7 @@ class _Views:
 
     def label(self, obs: Tensor, clip: np.ndarray) -> Tensor:
         """PD targets (N, nu) for observations (N, O) of rows that follow the clips (N,)."""
-        owner = self._of_clip[torch.from_numpy(clip)]
+        owner = self._of_clip[torch.as_tensor(clip)]
         acted = [(ids, view.act(obs[ids])) for k, view in enumerate(self._different)
                  if len(ids := torch.nonzero(owner == k).flatten())]  # fmt: skip
         target = torch.empty(len(obs), acted[0][1].shape[1])

@@ -119,8 +119,8 @@ def new_tokenizer(config: TokenizerConfig, table: ReferenceTable, seed: int) -> 
     torch.manual_seed(seed)
     tokenizer = MotionTokenizer(config, sizes_of(table, config.future), table.character.nu)
     with torch.no_grad():
-        tokenizer.action_mean.copy_(torch.from_numpy(table.target.mean(0)))
-        tokenizer.action_scale.copy_(torch.from_numpy(table.target.std(0)).clamp_min(0.1))
+        tokenizer.action_mean.copy_(torch.as_tensor(table.target.mean(0)))
+        tokenizer.action_scale.copy_(torch.as_tensor(table.target.std(0)).clamp_min(0.1))
     return tokenizer
 
 
@@ -255,7 +255,7 @@ def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed:
                 _teach(*job, threads=threads, quiet=False)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, context, begin_worker) as pool:
+    with ProcessPoolExecutor(config.workers, context, begin_worker, (str(torch.get_default_device()),)) as pool:
         running = {pool.submit(_teach, *job, threads=1, quiet=True): job[0].name for job in jobs}
         try:
             _report(running, len(jobs))
@@ -269,9 +269,11 @@ def _others(clip: Clip, clips: Sequence[Clip], config: FitConfig) -> list[Clip]:
     return [other for other in clips if other is not clip] + [other.mirror() for other in clips if config.mirror]
 
 
-def begin_worker() -> None:
-    """One thread for the sums of networks, and an end as soon as the parent has ended, by a signal or otherwise."""
+def begin_worker(device: str = "cpu") -> None:
+    """The parent's default device and one thread for the sums of networks, and an end as soon as the parent has ended,
+    by a signal or otherwise."""
     torch.set_num_threads(1)
+    torch.set_default_device(device)
     parent = multiprocessing.parent_process()
     assert parent is not None  # this runs in a pool's process
 

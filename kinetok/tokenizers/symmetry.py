@@ -47,7 +47,7 @@ class Mirror:
             task.place(np.arange(POSES), np.full(POSES, k), table.first[k] + reference)
             seen.append(task.observe(table.body.rows(table.first[k] + here)).astype(np.float64))
         index, sign = _pair(*seen, name=character)
-        return Mirror(index=torch.from_numpy(index), sign=torch.from_numpy(sign).float(), targets=task.layout["target"])
+        return Mirror(index=torch.as_tensor(index), sign=torch.as_tensor(sign).float(), targets=task.layout["target"])
 
     def observation(self, obs: Tensor) -> Tensor:
         """The mirror images (N, O) of observations (N, O)."""

@@ -113,7 +113,7 @@ def track(
     obs = env.reset()
     with torch.no_grad(), torch_threads(1):
         while running.any():
-            step = env.step(actor.act(torch.from_numpy(obs))[0].numpy())
+            step = env.step(actor.act(torch.as_tensor(obs))[0].numpy(force=True))
             obs, steps = step.obs, steps + 1
             counts = running & ~failed
             error = np.nan_to_num(task.error[counts], nan=np.inf, posinf=np.inf)
