@@ -9,6 +9,8 @@ from dataclasses import replace
 
 from kinetok.adapters.cola import CoLAConfig
 from kinetok.adapters.finetune import FinetuneConfig
+from kinetok.adapters.hindsight import HindsightConfig
+from kinetok.adapters.rlft import TokenPolicyConfig
 from kinetok.adapters.sft import SFTConfig
 from kinetok.gpt.pretrain import PretrainConfig
 from kinetok.gpt.refine import RefineConfig
@@ -197,8 +199,30 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """Demonstrations in a quarter of an hour, three million control steps of reward: docs/tutorial.md."""
-    return FinetuneConfig()
+    """Demonstrations in five minutes, then reward in the larger steps that the wider, colder nucleus bears:
+    docs/tutorial.md."""
+    return FinetuneConfig(
+        adapter=CoLAConfig(rank=32, alpha=64.0),
+        hindsight=HindsightConfig(rounds=2, iterations=600, samples=400_000, memory=6, restless=(0.4, 6.0)),
+        policy=TokenPolicyConfig(top_p=0.97, temperature=0.8),
+        samples=2_359_296,
+        eval_every=196_608,
+        eval_episodes=128,
+        ppo=replace(FinetuneConfig().ppo, target_kl=0.02, lr_max=1e-3, lam=0.97),
+    )
+
+
+def gpu_skill() -> FinetuneConfig:
+    """The laptop's, with four times as many worlds and samples: for --device cuda and some cores (docs/gpu.md)."""
+    laptop = laptop_skill()
+    return replace(
+        laptop,
+        samples=8_388_608,
+        rows=2048,
+        eval_every=1_048_576,
+        save_every=4_194_304,
+        ppo=replace(laptop.ppo, minibatch=8192),
+    )
 
 
 def paper_skill() -> FinetuneConfig:
@@ -223,4 +247,4 @@ def tiny_skill() -> FinetuneConfig:
     )
 
 
-FINETUNE = {"laptop": laptop_skill, "paper": paper_skill, "tiny": tiny_skill}
+FINETUNE = {"laptop": laptop_skill, "gpu": gpu_skill, "paper": paper_skill, "tiny": tiny_skill}

@@ -79,10 +79,11 @@ def test_an_unknown_preset_names_the_nearest():
         pick(presets.FIT, "one_clip", "preset")
 
 
-@pytest.mark.parametrize("build", presets.FINETUNE.values(), ids=presets.FINETUNE)
-def test_a_skill_draws_as_the_paper_does_and_is_judged_while_it_trains(build):
-    config = build()
-    assert (config.policy.top_p, config.policy.temperature) == (0.9, 1.0)  # GPC table 12
+@pytest.mark.parametrize("name", presets.FINETUNE)
+def test_a_skill_draws_as_the_paper_does_or_as_was_measured_and_is_judged_while_it_trains(name):
+    config = presets.FINETUNE[name]()
+    drawn = {"laptop": (0.97, 0.8), "gpu": (0.97, 0.8)}.get(name, (0.9, 1.0))  # docs/log.md; GPC table 12
+    assert (config.policy.top_p, config.policy.temperature) == drawn
     assert config.eval_every <= config.samples and config.eval_seconds * 30 >= 1
     assert config.rows * config.ppo.horizon >= config.ppo.minibatch
     assert config.critic_warmup * config.rows * config.ppo.horizon < config.samples
