@@ -213,15 +213,17 @@ def laptop_skill() -> FinetuneConfig:
 
 
 def gpu_skill() -> FinetuneConfig:
-    """The laptop's, with four times as many worlds and samples: for --device cuda and some cores (docs/gpu.md)."""
+    """The laptop's rollouts in half as many steps of twice as many worlds, and twice as many of them: for
+    --device cuda and some cores. Larger rollouts are not worth their time: what bounds a step is how far the policy
+    may move (docs/gpu.md)."""
     laptop = laptop_skill()
     return replace(
         laptop,
-        samples=8_388_608,
-        rows=2048,
+        samples=4_194_304,
+        rows=1024,
         eval_every=1_048_576,
-        save_every=4_194_304,
-        ppo=replace(laptop.ppo, minibatch=8192),
+        save_every=2_097_152,
+        ppo=replace(laptop.ppo, horizon=16),
     )
 
 
