@@ -61,6 +61,7 @@ def draw(
     *,
     generator: torch.Generator | None = None,
     top_p: float = 0.9,
+    least: int = 1,
     temperature: float = 1.0,
     guidance: float = 1.0,
     greedy: bool = False,
@@ -69,7 +70,8 @@ def draw(
     """Draw the tokens of one control step for state (N, state_dim) and c (N, cond_dim).
 
     generator: source of the uniform numbers; needed unless `greedy`, which takes the most probable option left.
-    top_p: mass of the base's nucleus; 1 keeps every option. caches: of `new_caches(adapted, N)`.
+    top_p: mass of the base's nucleus; 1 keeps every option; least: options it has at least. caches: of
+    `new_caches(adapted, N)`.
     """
     rows = len(state)
     if generator is None and not greedy:
@@ -81,7 +83,7 @@ def draw(
         )
     uniform = None if greedy or generator is None else uniforms(adapted, rows, generator)
     tokens, keep, log_prob = choose(
-        adapted, caches, state, c, uniform, top_p=top_p, temperature=temperature, guidance=guidance
+        adapted, caches, state, c, uniform, top_p=top_p, least=least, temperature=temperature, guidance=guidance
     )
     return Drawn(tokens=tokens, keep=keep, log_prob=log_prob)
 
@@ -101,6 +103,7 @@ def choose(
     uniform: Tensor | None,
     *,
     top_p: float,
+    least: int,
     temperature: float,
     guidance: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -120,7 +123,7 @@ def choose(
         y, token = adapted.head.begin(h), 0
         for d in range(choices):
             plain = base.head.logits(x, d) / temperature
-            kept = nucleus(plain, top_p)
+            kept = nucleus(plain, top_p, least)
             logits = restrict(guided(plain, adapted.head.logits(y, d) / temperature, guidance), kept)
             chosen = logits.argmax(-1) if uniform is None else option_at(logits, uniform[:, j, d])
             log_prob[:, j] += logits.gather(-1, chosen[:, None]).squeeze(-1) - logits.logsumexp(-1)

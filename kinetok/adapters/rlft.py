@@ -34,11 +34,14 @@ Controller = Callable[[Tensor], Tensor]  # observations (N, O) -> PD targets (N,
 
 @dataclass(frozen=True, kw_only=True)
 class TokenPolicyConfig:
-    """top_p: mass of the frozen prior's nucleus, 1 for no bound; temperature: divides the logits (GPC table 12); kl:
-    weight of the divergence from the prior in the loss, nats a step; entropy: weight of the bonus (NCP: top_p 1,
-    kl 0.05, entropy 0.01); guidance: how many times as far as the adapter says its logits go from the prior's."""
+    """top_p: mass of the frozen prior's nucleus, 1 for no bound; least: options that it has at least: what a prior that
+    is sure of itself does now and then, such as to set out from a stand, stays possible; temperature: divides the
+    logits (GPC table 12); kl: weight of the divergence from the prior in the loss, nats a step; entropy: weight of the
+    bonus (NCP: top_p 1, kl 0.05, entropy 0.01); guidance: how many times as far as the adapter says its logits go from
+    the prior's."""
 
     top_p: float = 0.9
+    least: int = 1
     temperature: float = 1.0
     kl: float = 0.0
     entropy: float = 0.0
@@ -47,6 +50,8 @@ class TokenPolicyConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.top_p <= 1.0:
             raise ConfigError(f"top_p must lie in (0, 1], not {self.top_p}; 1 keeps every token")
+        if self.least < 1:
+            raise ConfigError(f"least must be at least 1, not {self.least}: without an option there is nothing to draw")
         if not (self.temperature > 0.0 and self.kl >= 0.0 and self.entropy >= 0.0 and self.guidance >= 0.0):
             raise ConfigError(f"a temperature is above 0; kl, entropy and guidance are not below it: {self}")
 
@@ -84,7 +89,8 @@ class TokenPolicy:
         config, caches = self.config, new_caches(self.adapted, rows)
 
         def play(obs: Tensor, uniform: Tensor | None = None) -> tuple[Tensor, ...]:
-            how = {"top_p": config.top_p, "temperature": config.temperature, "guidance": config.guidance}
+            how = {"top_p": config.top_p, "least": config.least}
+            how |= {"temperature": config.temperature, "guidance": config.guidance}
             return choose(self.adapted, caches, *self._parts(obs), uniform, **how)
 
         return Replay(play) if replayed else play

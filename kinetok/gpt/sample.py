@@ -28,8 +28,8 @@ SORT_UP_TO = 2048
 TOP_K = (64, 256, 1024)
 
 
-def nucleus(logits: Tensor, p: float) -> Tensor:
-    """The smallest set of options whose probability reaches p, at least one: logits (N, V) -> (N, V) bool.
+def nucleus(logits: Tensor, p: float, least: int = 1) -> Tensor:
+    """The smallest set of options whose probability reaches p, `least` at least: logits (N, V) -> (N, V) bool.
 
     Among options of equal probability at the border the lower ids are kept. At p = 1 every option that is not
     impossible (logit -inf) stays. A large vocabulary is sorted in full only if 1024 options do not reach p.
@@ -40,8 +40,8 @@ def nucleus(logits: Tensor, p: float) -> Tensor:
         return logits > -torch.inf
     probs = F.softmax(logits, dim=-1, dtype=torch.float32)
     top, mass = _top(probs, p)
-    # Option i is needed when those before it do not reach p yet; the first always is.
-    needed = 1 + (mass[:, :-1] < p).sum(-1, keepdim=True)
+    # Option i is needed when those before it do not reach p yet; the first `least` always are.
+    needed = (1 + (mass[:, :-1] < p).sum(-1, keepdim=True)).clamp_min(min(least, mass.shape[-1]))
     border = top.gather(-1, needed - 1)
     keep = probs >= border
     # Rare, and dear on a CPU; on a GPU asking whether it is so costs more than doing it.

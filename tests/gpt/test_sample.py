@@ -51,6 +51,13 @@ def test_nucleus_by_hand(probabilities, p, kept):
     assert nucleus(logits_of(*probabilities), p)[0].nonzero().flatten().tolist() == kept
 
 
+def test_a_nucleus_of_at_least_so_many_by_hand():
+    logits = logits_of(0.01, 0.9, 0.05, 0.04)
+    for least, kept in ((1, [1]), (2, [1, 2]), (3, [1, 2, 3]), (9, [0, 1, 2, 3])):
+        assert nucleus(logits, 0.8, least)[0].nonzero().flatten().tolist() == kept
+    assert nucleus(logits, 0.97, 2)[0].nonzero().flatten().tolist() == [1, 2, 3]  # the mass asks for more
+
+
 @pytest.mark.parametrize("vocabulary", [1, 9, 729, 5000])
 @pytest.mark.parametrize("scale", [0.0, 0.5, 3.0])
 def test_nucleus_is_the_smallest_set_that_reaches_p(vocabulary, scale):
