@@ -204,7 +204,7 @@ def laptop_skill() -> FinetuneConfig:
     return FinetuneConfig(
         adapter=CoLAConfig(rank=32, alpha=64.0),
         hindsight=HindsightConfig(rounds=2, iterations=600, samples=400_000, memory=6, restless=(0.4, 6.0)),
-        policy=TokenPolicyConfig(top_p=0.97, temperature=0.8),
+        policy=TokenPolicyConfig(top_p=0.97, least=8, temperature=0.8),
         samples=2_359_296,
         eval_every=196_608,
         eval_episodes=128,
