@@ -445,30 +445,3 @@ def test_a_traceback_can_be_had(tmp_path, monkeypatch):
     monkeypatch.setenv("KINETOK_TRACEBACK", "1")
     with pytest.raises(ValueError, match="does not exist"):
         kinetok("clips", "info", tmp_path / "no.txt")
-
-
-def test_a_device_that_is_not_there_is_refused_before_any_work(clip):
-    for name in ("cudo", f"cuda:{torch.cuda.device_count()}"):
-        result = kinetok("tokenize", "fit", "--clips", clip, "--preset", "tiny", "--out", "fit", "--device", name)
-        assert result.exit_code == 2 and not Path("fit").exists()
-        assert f"torch cannot use '{name}'" in result.output and "here there is cpu" in result.output
-    assert torch.get_default_device() == torch.device("cpu")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_the_chain_on_a_gpu(clip):
-    def run(*args: object) -> None:
-        command = [sys.executable, "-m", "kinetok.cli", *map(str, args), "--device", "cuda", "--threads", "2"]
-        subprocess.run(command, check=True, capture_output=True)
-
-    clips = ("--clips", clip)
-    for samples in (1024, 2048):  # the second goes on where the first one ended
-        run("tokenize", "fit", *clips, "--preset", "tiny", "--out", "fit", "--set", f"ppo.samples={samples}")
-    run("pretrain", "--tokenizer", "fit", *clips, "--preset", "tiny", "--out", "prior")
-    few = [f"hindsight.{name}" for name in ("samples=640", "rows=32", "iterations=10", "rounds=2", "memory=1")]
-    for samples in (512, 1024):
-        told = [x for setting in (*few, f"samples={samples}") for x in ("--set", setting)]
-        method = ("--task", "target", "--method", "sft,hindsight,rl", "--preset", "tiny")
-        run("finetune", "--prior", "prior", *method, *clips, "--out", "skill", *told)
-    run("evaluate", "task", "--adapter", "skill", "--episodes", 4, "--json", "task.json")
-    run("evaluate", "tracking", "--tokenizer", "fit", *clips, "--json", "tracking.json")
