@@ -3,9 +3,9 @@
     choose = Replay(function) if state.device.type == "cuda" else function
     tokens, log_prob = choose(state, uniform)                      # new tensors each time
 
-Drawing the tokens of a step is some 1,700 operations, most of them small, which a GPU does faster than Python can ask for.
-What is not an argument is read where it lay at the first call: weights have to change in place, as optimizers change
-them. The function may not look at the value of a tensor.
+Drawing the tokens of a step is some 1,700 operations, most of them small, which a GPU does faster than Python can ask
+for. What is not an argument is read where it lay at the first call: weights have to change in place, as optimizers
+change them. The function may not look at the value of a tensor.
 """
 
 from collections.abc import Callable
