@@ -107,6 +107,7 @@ def test_settings_of_a_skill_reach_the_members_of_a_union():
         ("task.kind=stering", "did you mean 'steering'"),
         ("policy.entrpy=1", "did you mean 'entropy'"),
         ("policy.top_p=0", "top_p must lie in"),
+        ("policy.least=0", "least must be at least 1"),
         ("sft.iterations=0", "iterations must be at least 1"),
         ("methods=rl,sft", "sft before rl"),
     ):

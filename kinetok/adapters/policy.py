@@ -1,6 +1,7 @@
 """The token policy that reinforcement learning fine-tunes (GPC sec. 7.2, app. D.3).
 
-    drawn = draw(adapted, state, c, generator=generator, top_p=0.9)         # tokens, keep, log_prob
+    uniform = uniforms(adapted, len(state), generator)
+    drawn = draw(adapted, state, c, uniform, top_p=0.9)                      # tokens, keep, log_prob
     scored = score(adapted, state, c, drawn.tokens, drawn.keep)              # log_prob, entropy, with gradients
 
 Each choice is drawn from the adapted distribution restricted to the top-p nucleus of the frozen base, both given
@@ -16,6 +17,7 @@ Knows neither rewards nor advantages.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -27,8 +29,7 @@ from kinetok.gpt.sample import draw as option_at
 from kinetok.gpt.sample import nucleus, restrict
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drawn:
+class Drawn(NamedTuple):
     """tokens: (N, S) int64. keep: (N, S, D, K) bool, the options of each choice that the base's nucleus left.
     log_prob: (N, S), of each token under the distribution it was drawn from, in nats."""
 
@@ -53,66 +54,38 @@ def new_caches(adapted: Adapted, rows: int) -> tuple[KVCache, KVCache]:
     return adapted.new_cache(rows), adapted.new_cache(rows)
 
 
-@torch.no_grad()
-def draw(
-    adapted: Adapted,
-    state: Tensor,
-    c: Tensor | None,
-    *,
-    generator: torch.Generator | None = None,
-    top_p: float = 0.9,
-    least: int = 1,
-    temperature: float = 1.0,
-    guidance: float = 1.0,
-    greedy: bool = False,
-    caches: tuple[KVCache, KVCache] | None = None,
-) -> Drawn:
-    """Draw the tokens of one control step for state (N, state_dim) and c (N, cond_dim).
-
-    generator: source of the uniform numbers; needed unless `greedy`, which takes the most probable option left.
-    top_p: mass of the base's nucleus; 1 keeps every option; least: options it has at least. caches: of
-    `new_caches(adapted, N)`.
-    """
-    rows = len(state)
-    if generator is None and not greedy:
-        raise ValueError("drawing needs generator=torch.Generator(...); or pass greedy=True")
-    caches = caches or new_caches(adapted, rows)
-    if caches[0].rows != rows:
-        raise ValueError(
-            f"the caches hold {caches[0].rows} rows and the state has {rows}; make new_caches(adapted, {rows})"
-        )
-    uniform = None if greedy or generator is None else uniforms(adapted, rows, generator)
-    tokens, keep, log_prob = choose(
-        adapted, caches, state, c, uniform, top_p=top_p, least=least, temperature=temperature, guidance=guidance
-    )
-    return Drawn(tokens=tokens, keep=keep, log_prob=log_prob)
-
-
 def uniforms(adapted: Adapted, rows: int, generator: torch.Generator) -> Tensor:
-    """What `choose` draws by: a number in [0, 1) for every choice of a control step, (rows, S, D)."""
+    """What `draw` draws by: a number in [0, 1) for every choice of a control step, (rows, S, D)."""
     shape = rows, adapted.base.config.tokens_per_step, adapted.base.head.choices
     return torch.rand(shape, generator=generator, device=generator.device)
 
 
 @torch.no_grad()
-def choose(
+def draw(
     adapted: Adapted,
-    caches: tuple[KVCache, KVCache],
     state: Tensor,
     c: Tensor | None,
     uniform: Tensor | None,
     *,
-    top_p: float,
-    least: int,
-    temperature: float,
-    guidance: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """tokens, keep and log_prob of a `Drawn`, given the numbers it is drawn by, None for the most probable options.
+    top_p: float = 0.9,
+    least: int = 1,
+    temperature: float = 1.0,
+    guidance: float = 1.0,
+    caches: tuple[KVCache, KVCache] | None = None,
+) -> Drawn:
+    """Draw the tokens of one control step for state (N, state_dim) and c (N, cond_dim).
 
-    Looks at no tensor's value, so that a GPU can replay it."""
+    uniform: of `uniforms(adapted, N, generator)`; None takes the most probable option left. top_p: mass of the base's
+    nucleus; 1 keeps every option; least: options it has at least. caches: of `new_caches(adapted, N)`. Looks at no
+    tensor's value, so that a GPU can replay it (gpt.replay).
+    """
     _check(adapted, temperature)
     base, rows = adapted.base, len(state)
-    for_base, for_bent = caches
+    for_base, for_bent = caches or new_caches(adapted, rows)
+    if for_base.rows != rows:
+        raise ValueError(
+            f"the caches hold {for_base.rows} rows and the state has {rows}; make new_caches(adapted, {rows})"
+        )
     steps, choices, options = base.config.tokens_per_step, base.head.choices, base.head.options
     tokens = torch.empty(rows, steps, dtype=torch.int64, device=state.device)
     keep = torch.empty(rows, steps, choices, options, dtype=torch.bool, device=state.device)
@@ -130,7 +103,7 @@ def choose(
             keep[:, j, d], token = kept, token * options + chosen
             x, y = base.head.push(x, d, chosen), adapted.head.push(y, d, chosen)
         tokens[:, j] = token
-    return tokens, keep, log_prob
+    return Drawn(tokens, keep, log_prob)
 
 
 def score(
@@ -188,7 +161,7 @@ def guided(plain: Tensor, bent: Tensor, guidance: float) -> Tensor:
 
 def _check(adapted: Adapted, temperature: float) -> None:
     if temperature <= 0.0:
-        raise ValueError(f"temperature must be above 0, not {temperature}; for the most probable pass greedy=True")
+        raise ValueError(f"temperature must be above 0, not {temperature}; for the most probable pass no uniform")
     drops = adapted.training and any(isinstance(m, torch.nn.Dropout) and m.p > 0.0 for m in adapted.gpt.modules())
     if drops:
         raise ValueError(

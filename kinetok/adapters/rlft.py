@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from kinetok.adapters.adapted import Adapted
-from kinetok.adapters.policy import choose, new_caches, score, uniforms
+from kinetok.adapters.policy import draw, new_caches, score, uniforms
 from kinetok.config import ConfigError
 from kinetok.gpt.controller import Prior
 from kinetok.gpt.data import Starts
@@ -78,20 +78,27 @@ class TokenPolicy:
         """PD targets (N, nu) and the tokens behind them; without a generator the most probable ones."""
         key = len(obs), generator is None
         if key not in self._players:
-            self._players[key] = self._player(*key, replayed=obs.device.type == "cuda")
+            self._players[key] = self._player(len(obs), replayed=obs.device.type == "cuda")
         given = () if generator is None else (uniforms(self.adapted, len(obs), generator),)
         tokens, keep, log_prob = self._players[key](obs, *given)
         action = self.tokenizer.decode(self.tokens.to_codes(tokens), obs[:, : self.state_dim])
         return action, {"tokens": tokens, "keep": keep, "log_prob": log_prob.sum(-1)}
 
-    def _player(self, rows: int, greedy: bool, *, replayed: bool) -> Callable[..., tuple[Tensor, ...]]:
-        """tokens, keep, log_prob of observations (rows, O), and of the numbers to draw by unless `greedy`."""
+    def _player(self, rows: int, *, replayed: bool) -> Callable[..., tuple[Tensor, ...]]:
+        """tokens, keep, log_prob of observations (rows, O) and the numbers to draw by, if any."""
         config, caches = self.config, new_caches(self.adapted, rows)
 
         def play(obs: Tensor, uniform: Tensor | None = None) -> tuple[Tensor, ...]:
-            how = {"top_p": config.top_p, "least": config.least}
-            how |= {"temperature": config.temperature, "guidance": config.guidance}
-            return choose(self.adapted, caches, *self._parts(obs), uniform, **how)
+            return draw(
+                self.adapted,
+                *self._parts(obs),
+                uniform,
+                top_p=config.top_p,
+                least=config.least,
+                temperature=config.temperature,
+                guidance=config.guidance,
+                caches=caches,
+            )
 
         return Replay(play) if replayed else play
 

@@ -7,7 +7,7 @@ import torch
 
 from kinetok.adapters import FullConfig, LoRAConfig
 from kinetok.adapters.adapted import Adapted
-from kinetok.adapters.policy import draw, guided, new_caches, score
+from kinetok.adapters.policy import draw, guided, new_caches, score, uniforms
 from kinetok.gpt import GPT, GPTConfig, nucleus, sample
 from tests.adapters.bending import HEADS, KINDS, batch, bend, build, move
 
@@ -38,7 +38,7 @@ def test_by_hand(head, choices, temperature):
     # top_p .7: .5 < .7 <= .8, so options 0 and 1 stay; adapted (.2, .3) / .5 = (.4, .6); base (.5, .3) / .8 =
     # (.625, .375). Each of the 2 tokens has `choices` choices, all alike.
     adapted, state = by_hand(head, temperature), torch.zeros(2000, 1)
-    drawn = draw(adapted, state, None, generator=seeded(), top_p=0.7, temperature=temperature)
+    drawn = draw(adapted, state, None, uniforms(adapted, len(state), seeded()), top_p=0.7, temperature=temperature)
     assert drawn.keep.shape == (2000, 2, choices, 4)
     assert (drawn.keep == torch.tensor([True, True, False, False])).all()
     digits = adapted.base.split(drawn.tokens)
@@ -58,11 +58,11 @@ def test_by_hand(head, choices, temperature):
 def test_at_the_start_it_draws_what_the_base_samples(head):
     adapted, (state, c, _) = bend("lora", head), batch(64)
     plain = sample(adapted.base, state, generator=seeded(4), top_p=0.8, temperature=1.3)
-    drawn = draw(adapted, state, c, generator=seeded(4), top_p=0.8, temperature=1.3)
+    drawn = draw(adapted, state, c, uniforms(adapted, len(state), seeded(4)), top_p=0.8, temperature=1.3)
     assert torch.equal(drawn.tokens, plain)
     scored = score(adapted, state, c, drawn.tokens, drawn.keep, temperature=1.3, reference=True)
     torch.testing.assert_close(scored.kl, torch.zeros(64), rtol=0, atol=1e-5)
-    greedy = draw(adapted, state, c, greedy=True)
+    greedy = draw(adapted, state, c, None)
     assert torch.equal(greedy.tokens, sample(adapted.base, state, greedy=True))
 
 
@@ -73,13 +73,13 @@ def test_score_says_what_draw_said(head, kind, top_p, temperature):
     adapted, (state, c, _) = bend(kind, head, moved=True).double(), batch(64)
     state, c = state.double(), c.double()
     settings = {"top_p": top_p, "temperature": temperature}
-    drawn = draw(adapted, state, c, generator=seeded(), **settings, caches=new_caches(adapted, 64))
+    drawn = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), **settings, caches=new_caches(adapted, 64))
     scored = score(adapted, state, c, drawn.tokens, drawn.keep, temperature=temperature, reference=True)
     torch.testing.assert_close(scored.log_prob.detach(), drawn.log_prob.sum(-1), rtol=0, atol=1e-9)
     assert drawn.keep.gather(-1, adapted.base.split(drawn.tokens)[..., None]).all()
     assert top_p < 1.0 or drawn.keep.all()
     assert (scored.kl >= -1e-5).all() and (scored.entropy >= -1e-5).all()
-    again = draw(adapted, state, c, generator=seeded(), **settings)
+    again = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), **settings)
     assert torch.equal(again.tokens, drawn.tokens) and torch.equal(again.keep, drawn.keep)
 
 
@@ -87,7 +87,7 @@ def test_score_says_what_draw_said(head, kind, top_p, temperature):
 def test_guidance_goes_further_the_same_way(head):
     adapted, (state, c, _) = bend("cola", head, moved=True).double(), batch(64)
     state, c = state.double(), c.double()
-    drawn = draw(adapted, state, c, generator=seeded(), top_p=0.8, guidance=2.5)
+    drawn = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), top_p=0.8, guidance=2.5)
     scored = score(adapted, state, c, drawn.tokens, drawn.keep, guidance=2.5, reference=True)
     torch.testing.assert_close(scored.log_prob.detach(), drawn.log_prob.sum(-1), rtol=0, atol=1e-9)
     plain = score(adapted, state, c, drawn.tokens, drawn.keep, guidance=0.0, reference=True)
@@ -95,7 +95,7 @@ def test_guidance_goes_further_the_same_way(head):
     here, there = torch.randn(2, 5, 7, generator=seeded())
     torch.testing.assert_close(guided(here, there, 2.5) - here, 2.5 * (there - here))
     assert guided(here, there, 1.0) is there
-    base = draw(adapted, state, c, generator=seeded(), guidance=0.0)
+    base = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), guidance=0.0)
     assert torch.equal(base.tokens, sample(adapted.base, state, generator=seeded(), top_p=0.9))
 
 
@@ -105,7 +105,7 @@ def test_in_single_precision_score_and_draw_differ_by_rounding(head, kind):
     adapted, (state, c, _) = Adapted(build(head, scale=2.0), KINDS[kind], 2), batch(64)
     optimizer = torch.optim.Adam(adapted.trainable(), lr=3e-3)
     for seed in range(3):
-        drawn = draw(adapted, state, c, generator=seeded(seed))
+        drawn = draw(adapted, state, c, uniforms(adapted, len(state), seeded(seed)))
         scored = score(adapted, state, c, drawn.tokens, drawn.keep)
         torch.testing.assert_close(scored.log_prob.detach(), drawn.log_prob.sum(-1), rtol=1e-5, atol=1e-5)
         optimizer.zero_grad()
@@ -117,7 +117,7 @@ def test_in_single_precision_score_and_draw_differ_by_rounding(head, kind):
 @heads
 def test_the_nucleus_is_that_of_the_base(head):
     adapted, (state, c, _) = bend("cola", head, moved=True), batch(64)
-    drawn = draw(adapted, state, c, generator=seeded(), top_p=0.6)
+    drawn = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), top_p=0.6)
     base = adapted.base(state, drawn.tokens).softmax(-1)
     mass = (base * drawn.keep).sum(-1)
     smallest = base.masked_fill(~drawn.keep, 2.0).amin(-1)
@@ -153,12 +153,10 @@ def test_over_all_actions_probability_entropy_and_kl_are_those_of_one_distributi
 
 def test_what_cannot_be_drawn_is_refused():
     adapted, (state, c, tokens) = bend("lora"), batch()
-    with pytest.raises(ValueError, match=r"drawing needs generator=torch\.Generator"):
-        draw(adapted, state, c)
     with pytest.raises(ValueError, match=r"temperature must be above 0, not 0\.0"):
-        draw(adapted, state, c, generator=seeded(), temperature=0.0)
+        draw(adapted, state, c, uniforms(adapted, len(state), seeded()), temperature=0.0)
     with pytest.raises(ValueError, match=r"hold 4 rows and the state has 5; make new_caches\(adapted, 5\)"):
-        draw(adapted, state, c, generator=seeded(), caches=new_caches(adapted, 4))
+        draw(adapted, state, c, uniforms(adapted, len(state), seeded()), caches=new_caches(adapted, 4))
     dropping = Adapted(build(), LoRAConfig(dropout=0.1), 2).train()
     with pytest.raises(ValueError, match="in training mode and drops units out"):
         score(dropping, state, c, tokens, torch.ones(5, 4, 1, 9, dtype=torch.bool))
