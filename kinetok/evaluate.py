@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from kinetok import metrics
 from kinetok.adapters.finetune import Skill
-from kinetok.adapters.rlft import Controller, play
+from kinetok.adapters.rlft import Controller, TokenPolicy, play
 from kinetok.config import ConfigError, pick
 from kinetok.gpt.controller import Prior, PriorController, Recording, roll
 from kinetok.motion.character import Character
@@ -184,7 +184,8 @@ def evaluate_task(
 
     A Scorecard's measures: rewards, survival, and what the task defines, such as success_rate and final_distance_m,
     None where it never happened. push: m/s at the root, every two seconds. top_p, temperature: of the tokens, by
-    default the skill's own, or 0.9 and 1.
+    default the skill's own, or 0.9 and 1. token_entropy, of a skill: nats of a control step, the mean surprise of
+    the tokens that were drawn.
     """
     drawn: dict[str, Any] = {
         name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None
@@ -194,14 +195,29 @@ def evaluate_task(
     if adapter is not None:
         skill = Skill.from_pretrained(adapter, prior, tokenizer)
         skill = replace(skill, policy=replace(skill.policy, **drawn))
-        config, model, controller = skill.task, skill.prior, skill.controller(seed)
+        config, model = skill.task, skill.prior
+        controller = surprised = _Surprised(TokenPolicy(skill.adapted, model.tokenizer, skill.policy), seeded(seed))
         if task not in (None, config.kind):
             raise ConfigError(f"{adapter} was bent to {config.kind!r} and cannot read what {task!r} asks")
     else:
         model, config = Prior.from_pretrained(prior or "humanoid-gpt", tokenizer), TASKS[task or "target"][0]()
-        controller = _blind(PriorController(model, generator=seeded(seed), **drawn))
+        controller, surprised = _blind(PriorController(model, generator=seeded(seed), **drawn)), None
     played = play(controller, config, model, episodes=episodes, seconds=seconds, push=push, seed=seed, threads=threads)
-    return played.score.measures | {"task": config.kind, "push_mps": push, "seed": seed} | drawn
+    entropy = {} if surprised is None else {"token_entropy": float(torch.stack(surprised.nats).mean())}
+    return played.score.measures | entropy | {"task": config.kind, "push_mps": push, "seed": seed} | drawn
+
+
+class _Surprised:
+    """A skill as it is played, and how unlikely what it drew was: nats, one number a control step."""
+
+    def __init__(self, policy: TokenPolicy, generator: torch.Generator):
+        self.policy, self.generator = policy, generator
+        self.nats: list[Tensor] = []
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        action, drawn = self.policy.draw(obs, self.generator)
+        self.nats.append(-drawn["log_prob"].mean())
+        return action
 
 
 def _blind(alone: PriorController) -> Controller:

@@ -199,13 +199,13 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """Demonstrations in seven minutes, then reward in forty, of which the critic has the first four to itself:
-    docs/tutorial.md."""
+    """Demonstrations in seven minutes, then reward in seventy, of which the critic has the first four to itself; after
+    forty it does most of what it will: docs/tutorial.md."""
     return FinetuneConfig(
         adapter=CoLAConfig(rank=32, alpha=64.0),
         hindsight=HindsightConfig(rounds=2, iterations=600, samples=400_000, memory=6, restless=(0.4, 6.0)),
         policy=TokenPolicyConfig(top_p=0.97, least=8, temperature=0.8),
-        samples=2_359_296,
+        samples=3_932_160,
         eval_every=196_608,
         eval_episodes=128,
         critic_warmup=30,

@@ -166,6 +166,7 @@ def test_the_prior_alone_does_what_a_skill_does_that_has_learned_nothing(steerin
     assert bent["velocity_error_mps"] != alone["velocity_error_mps"]  # the skill's own speeds, the task's usual ones
     target = evaluate_task(None, prior, **options)
     assert target["task"] == "target" and target["success_rate"] is None and target["final_distance_m"] is None
+    assert "token_entropy" in bent and "token_entropy" not in alone
 
 
 def test_how_tokens_are_drawn_may_be_changed(steering):
@@ -173,7 +174,8 @@ def test_how_tokens_are_drawn_may_be_changed(steering):
     options = {"episodes": 2, "seconds": 0.5, "seed": 3, "threads": 1}
     usual, own = evaluate_task(skill, **options), evaluate_task(skill, top_p=0.9, temperature=1.0, **options)
     assert own == usual | {"top_p": 0.9, "temperature": 1.0}
-    assert evaluate_task(skill, temperature=0.5, **options)["return"] != usual["return"]
+    calm = evaluate_task(skill, temperature=0.5, **options)
+    assert calm["return"] != usual["return"] and 0 < calm["token_entropy"] < usual["token_entropy"]
     assert evaluate_task(None, prior, top_p=0.3, **options)["return"] != evaluate_task(None, prior, **options)["return"]
 
 
