@@ -1,7 +1,7 @@
 """Plot what a training logged: its evaluations over samples, one panel a figure, one line a run.
 
 python benchmarks/curves.py runs/a/distill runs/b/distill --out docs/curves.png
-python benchmarks/curves.py cola=runs/cola lora=runs/lora --show eval/success_rate,eval/return --out target.png
+python benchmarks/curves.py cola=runs/0 cola=runs/1 lora=runs/lora --show eval/success_rate,eval/return --out target.png
 """
 
 import argparse
@@ -27,16 +27,20 @@ LABELS = {
 
 
 def plot(runs: list[str], shown: list[str], out: Path) -> None:
-    """runs: directories, or NAME=directory; shown: keys of metrics.jsonl."""
+    """runs: directories, or NAME=directory, of which those of one name share a colour; shown: keys of metrics.jsonl."""
+    colours: dict[str, str] = {}
     figure, panels = plt.subplots(len(shown), 1, figsize=(7, 3 * len(shown)), sharex=True, squeeze=False)
     for run in runs:
         name, _, place = run.rpartition("=")
+        name = name or "/".join(Path(place).parts[-3:])
+        told = None if name in colours else name
+        colour = colours.setdefault(name, f"C{len(colours)}")
         lines = list(read_metrics(Path(place) / "metrics.jsonl"))
         for axes, key in zip(panels[:, 0], shown, strict=True):
             points = [(line["step"] / 1e6, line[key]) for line in lines if key in line]
             if not points:
                 raise SystemExit(f"{place}/metrics.jsonl holds no {key}")
-            axes.plot(*zip(*points, strict=True), label=name or "/".join(Path(place).parts[-3:]))
+            axes.plot(*zip(*points, strict=True), label=told, color=colour)
     for axes, key in zip(panels[:, 0], shown, strict=True):
         axes.set_ylabel(LABELS.get(key, key))
         axes.grid(alpha=0.3)
