@@ -135,6 +135,32 @@ def test_clips_check_tells_repairs_and_refuses(data_dir, tmp_path):
     assert lone.exit_code == 1 and "give both --fix and --out" in lone.output
 
 
+def test_clips_check_goes_on_past_what_it_cannot_read(data_dir, tmp_path):
+    walk = (data_dir / "bvh" / "cmu_daz" / "cmu_02_01.bvh").read_text()
+    for folder, text in (("a", walk), ("b", "HIERARCHY\nROOT"), ("c", walk)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "walk.bvh").write_text(text)
+    out = tmp_path / "good.safetensors"
+    told = kinetok("clips", "check", tmp_path, tmp_path / "none.bvh", "--fix", "--out", out)
+    assert told.exit_code == 1
+    assert "walk.bvh\n  refused unreadable" in told.output and "none.bvh: file: does not exist" in told.output
+    copy, whole = tmp_path / "a" / "walk.bvh", tmp_path / "c" / "walk.bvh"
+    assert f"{copy} walk is in {whole} walk from 0.00 s on" in told.output
+    assert f"left out: {copy} walk (a copy), none.bvh, walk.bvh" in told.output
+    assert [motion.name for motion in read_clips(out)] == ["walk"]
+    assert kinetok("clips", "check", tmp_path / "a", tmp_path / "c").exit_code == 0  # a copy alone is no fault
+
+
+def test_a_library_is_of_one_body(clip, data_dir, tmp_path):
+    robot, out = data_dir / "g1" / "kimodo_wxyz" / "kimodo_walk.csv", tmp_path / "both.safetensors"
+    result = kinetok("clips", "import", clip, robot, "--out", out)
+    assert result.exit_code == 1 and not out.exists()
+    assert "kimodo_walk is of 'g1'; wave is of 'humanoid': a library holds motion of one body" in result.output
+    asked = kinetok("clips", "import", robot, "--dialect", "kimodo", "--fps", 60, "--out", out)
+    assert asked.exit_code == 0 and "kimodo as asked, 60 fps as asked" in read_clips(out)[0].source
+    assert "0.0 is not in the range" in kinetok("clips", "import", robot, "--fps", 0, "--out", out).output
+
+
 def test_clips_info_says_what_a_file_holds(clip):
     result = kinetok("clips", "info", clip)
     header, row = result.output.splitlines()

@@ -7,6 +7,16 @@ import click
 
 from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, load_clips, one_clip, option_seed, write_motion
 
+option_fps = click.option(
+    "--fps",
+    type=click.FloatRange(1, 1000),
+    default=None,
+    help="Frame rate of files that name none (robot CSV, AMC).",
+)
+option_dialect = click.option(
+    "--dialect", default=None, help="Of robot CSV that leaves it open: lafan1, kimodo or bones-seed."
+)
+
 
 @click.group(cls=Chain)
 def clips() -> None:
@@ -41,57 +51,86 @@ def clips_info(paths: tuple[Path, ...]) -> None:
 )
 @click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
 @click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
-@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
-def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, fps: float | None) -> None:
+@option_fps
+@option_dialect
+def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, fps, dialect) -> None:
     """Look for what is wrong with motion: lead-ins, jumps, spikes, units, up axis, floor, duplicates.
 
-    What has one right repair is repaired by --fix (and by every command that reads recorded skeletons); the rest is
-    refused with its frame and joint. Exits with 1 where anything was refused.
+    What has one right repair is repaired by --fix (and by every command that reads recorded motion); the rest is
+    refused with its frame and joint. Of two copies --fix keeps the longer one. Exits with 1 where anything was refused.
     """
     from kinetok.motion.check import check, report
     from kinetok.motion.duplicates import duplicates
-    from kinetok.motion.formats import read
+    from kinetok.motion.formats import FormatError, files_of, read_file
 
     if fix != (out is not None):
         raise ValueError("--fix writes what it repairs: give both --fix and --out F.safetensors")
-    motions = [motion for path in paths for motion in read(path, fps=fps)]
-    refused = set()
-    for motion in motions:
+    read, left_out = [], []  # (file, motion), names
+    for path in paths:
+        try:
+            files = files_of(path)
+        except FormatError as error:
+            files = []
+            left_out.append(_refuse(path, error))
+        for file, known in files:
+            try:
+                read += [(file, motion) for motion in read_file(file, known, fps=fps, dialect=dialect)]
+            except ValueError as error:
+                left_out.append(_refuse(file, error))
+    names = [motion.name for _, motion in read]
+    labels = [f"{file} {name}" if names.count(name) > 1 else name for name, (file, _) in zip(names, read, strict=True)]
+    good = []
+    for label, (_, motion) in zip(labels, read, strict=True):
         findings = check(motion)
-        refused |= {motion.name} if any(f.severity == "refused" for f in findings) else set()
-        click.echo(f"{motion.name}\n  " + report(findings).replace("\n", "\n  "))
-    for pair in duplicates(motions):
-        part, whole = motions[pair.part].name, motions[pair.whole].name
-        click.echo(f"{part} is in {whole} from {pair.start:.2f} s on{', mirrored' if pair.mirrored else ''}")
+        good.append(not any(f.severity == "refused" for f in findings))
+        click.echo(f"{label}\n  " + report(findings).replace("\n", "\n  "))
+    left_out += [label for label, kept in zip(labels, good, strict=True) if not kept]
+    failed = bool(left_out)
+    for pair in duplicates([motion for _, motion in read]):
+        mirrored = ", mirrored" if pair.mirrored else ""
+        click.echo(f"{labels[pair.part]} is in {labels[pair.whole]} from {pair.start:.2f} s on{mirrored}")
+        if not pair.mirrored and good[pair.whole] and good[pair.part]:
+            good[pair.part] = False
+            left_out.append(f"{labels[pair.part]} (a copy)")
     if out is not None:
-        write_fixed(out, motions, refused, character)
-    if refused:
+        write_fixed(out, [motion for (_, motion), kept in zip(read, good, strict=True) if kept], left_out, character)
+    if failed:
         raise click.exceptions.Exit(1)
 
 
-def write_fixed(out: Path, motions: list, refused: set[str], character: str | None) -> None:
-    """A library of the motions that were not refused, mended."""
+def _refuse(path: Path, error: ValueError) -> str:
+    """Say that a file cannot be read; its name."""
+    click.echo(f"{path.name}\n  refused unreadable {error}")
+    return path.name
+
+
+def write_fixed(out: Path, motions: list, left_out: list[str], character: str | None) -> None:
+    """A library of the motions, mended."""
     from kinetok.motion.check import mend
     from kinetok.motion.library import ClipLibrary
     from kinetok.motion.retarget import retarget
     from kinetok.motion.skeleton import SkeletonMotion
 
     check_suffix(out, ".safetensors")
-    mended = [mend(motion)[0] for motion in motions if motion.name not in refused]
-    if not mended:
+    if not motions:
         raise ValueError(f"--out {out}: every motion was refused, there is nothing to write")
+    mended = [mend(motion)[0] for motion in motions]
     fitted = [retarget(m, character or "humanoid").clip if isinstance(m, SkeletonMotion) else m for m in mended]
     ClipLibrary.write(out, fitted)
-    click.echo(f"wrote {out}: {len(fitted)} clips; left out: {', '.join(sorted(refused)) or 'none'}")
+    click.echo(f"wrote {out}: {len(fitted)} clips; left out: {', '.join(sorted(left_out)) or 'none'}")
 
 
 @clips.command("import")
 @click.argument("paths", nargs=-1, required=True, type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
 @click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
-@click.option("--fps", type=float, default=None, help="Frame rate of files that name none (robot CSV, AMC).")
-def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps: float | None) -> None:
-    """Read motion files of any known format and write one memory-mapped library.
+@option_fps
+@option_dialect
+def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps, dialect) -> None:
+    """Read motion files of any known format, alone or in folders, and write one memory-mapped library.
+
+    What has one right repair is repaired, and said; wrong units, axes and leaps of the root are refused. `kinetok clips
+    check` says more and is stricter.
 
     \b
     BVH, ASF/AMC, AMASS npz, poselib npy          retargeted to --character
@@ -100,7 +139,11 @@ def clips_import(paths: tuple[Path, ...], out: Path, character: str | None, fps:
     from kinetok.motion.library import ClipLibrary
 
     check_suffix(out, ".safetensors")
-    found = load_clips(paths, character, fps)
+    found = load_clips(paths, character, fps, dialect)
+    bodies = sorted({clip.character for clip in found})
+    if len(bodies) > 1:
+        some = "; ".join(f"{next(c.name for c in found if c.character == body)} is of {body!r}" for body in bodies)
+        raise ValueError(f"{some}: a library holds motion of one body. Import each into a library of its own")
     ClipLibrary.write(out, found)
     click.echo(f"wrote {out}: {len(found)} clips, {sum(c.seconds for c in found):.1f} s")
 

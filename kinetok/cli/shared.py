@@ -89,13 +89,19 @@ def configured(presets: str):
     return decorate
 
 
-def load_clips(paths: tuple[Path, ...], character: str | None = None, fps: float | None = None):
+def load_clips(
+    paths: tuple[Path, ...], character: str | None = None, fps: float | None = None, dialect: str | None = None
+):
+    """The clips of all paths; what was repaired or assumed is said on stderr."""
     from kinetok.motion.formats import read_clips
 
-    found = [clip for path in paths for clip in read_clips(path, character, fps=fps)]
+    def say(line: str) -> None:
+        click.echo(line, err=True)
+
+    found = [clip for path in paths for clip in read_clips(path, character, fps=fps, dialect=dialect, say=say)]
     for clip in found:
         if "assumed" in clip.source:
-            click.echo(f"{clip.name}: {clip.source}", err=True)
+            say(f"{clip.name}: {clip.source}")
     return found
 
 

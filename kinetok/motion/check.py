@@ -47,7 +47,7 @@ UNIT_ERROR = 0.1  # quaternion norms further from 1 are worth a note
 SIZE = (0.5, 2.6)  # metres: the rest pose of a body, joints only
 HUMAN = (1.4, 2.1)  # the same for an adult
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "CMU units": 0.0564}
-FLOOR, FLOOR_SPREAD, FLOOR_DEEP = 0.025, 0.06, 0.15  # metres
+FLOOR, FLOOR_SPREAD, FLOOR_DEEP, FLOOR_WRONG = 0.025, 0.06, 0.15, 0.3  # metres
 WINDOW_SECONDS = 1.0
 
 Severity = Literal["fixed", "refused", "note"]
@@ -439,6 +439,9 @@ def _mend_floor(motion: M) -> tuple[M, list[Finding]]:
         message = (
             f"the floor {kind}: feet stand between {stance.min():+.3f} and {stance.max():+.3f} m (stairs, or drift)"
         )
+        if stance.min() < -FLOOR_WRONG:
+            message += ": under the floor, as where the path is told along other axes or in another unit than the body"
+            return motion, [_finding("floor", "refused", message, frame=int(low.argmin()), value=spread)]
         return motion, [_finding("floor", "note", message, frame=frame, value=spread)]
     found = []
     if abs(level) > FLOOR and (np.sign(level) * stance).min() > FLOOR / 2:

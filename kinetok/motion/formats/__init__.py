@@ -3,9 +3,9 @@
     motions = read(Path("walk.bvh"))                  # [SkeletonMotion], as recorded, or [Clip] of its own character
     clips = read_clips(Path("recordings"), "g1")      # every file of a folder, skeletons retargeted to the character
 
-A format is told by its suffix, and by content where a suffix is not its own. In a folder, files of no known format are
-passed over; a file that is named must be readable. Clips keep the character they were recorded for: DeepMimic's
-humanoid, Unitree's G1.
+A format is told by its suffix, and by content where a suffix is not its own. In a folder and the folders in it, files
+of no known format are passed over; a file that is named must be readable. Clips keep the character they were recorded
+for: DeepMimic's humanoid, Unitree's G1.
 """
 
 import fnmatch
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from kinetok.motion.check import mend
+from kinetok.motion.check import FLOOR_WRONG, mend, report
 from kinetok.motion.clip import Clip
 from kinetok.motion.error import FormatError
 from kinetok.motion.formats.amass import is_amass, read_amass, write_amass
@@ -45,24 +45,26 @@ def read_library(path: Path) -> list[Clip]:
 
 @dataclass(frozen=True)
 class Format:
-    """name; suffixes: lower case; sniff: whether a file of such a suffix is one; read: its reader; rate: the reader
-    takes `fps`, since the files name no frame rate."""
+    """name; suffixes: lower case; sniff: whether a file of such a suffix is one; read: its reader; untold: what the
+    files do not say and the reader takes, of "fps" and "dialect"."""
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[Path], bool]
     read: Callable[..., Clip | SkeletonMotion | list[Clip]]
-    rate: bool = False
+    untold: tuple[str, ...] = ()
 
 
+RATES = (1.0, 1000.0)  # frames per second that a recording may have
+OWN = "kinetok"
 FORMATS = (
     Format("DeepMimic", (".txt", ".json"), is_deepmimic, read_deepmimic),
-    Format("kinetok", (".safetensors",), by_suffix, read_library),
+    Format(OWN, (".safetensors",), by_suffix, read_library),
     Format("BVH", (".bvh",), by_suffix, read_bvh),
-    Format("ASF/AMC", (".amc",), by_suffix, read_amc, rate=True),
+    Format("ASF/AMC", (".amc",), by_suffix, read_amc, untold=("fps",)),
     Format("AMASS", (".npz",), is_amass, read_amass),
     Format("mjlab", (".npz",), is_mjlab, read_mjlab),
-    Format("Unitree G1", (".csv",), is_robot_csv, read_robot_csv, rate=True),
+    Format("Unitree G1", (".csv",), is_robot_csv, read_robot_csv, untold=("fps", "dialect")),
     Format("GMR", (".pkl",), is_gmr, read_gmr),
     Format("MimicKit", (".pkl",), is_mimickit, read_mimickit),
     Format("ProtoMotions", (".motion",), by_suffix, read_protomotions),
@@ -79,26 +81,60 @@ NO_MOTION = (
 )
 
 
-def read(path: Path, *, fps: float | None = None) -> list[Clip | SkeletonMotion]:
-    """The motions of a file, of a kinetok library, or of every such file directly in a folder.
+def read(path: Path, *, fps: float | None = None, dialect: str | None = None) -> list[Clip | SkeletonMotion]:
+    """The motions of a file, of a kinetok library, or of every such file in a folder and those in it.
 
     fps: the frame rate of files that name none (robot CSV, AMC); None is their format's usual one, see `source`.
+    dialect: of robot CSV that leaves it open (`robot_csv.DIALECTS`).
     """
-    return [motion for file, known in _files(path) for motion in _read(file, known, fps)]
+    return [motion for file, known in files_of(path) for motion in read_file(file, known, fps=fps, dialect=dialect)]
 
 
-def read_clips(path: Path, character: str | None = None, *, fps: float | None = None) -> list[Clip]:
-    """The motions of a path as clips. Recorded skeletons are mended (motion.check) and retargeted to `character`,
-    "humanoid" when None; clips of a robot or of a library stay what they are, and one of another character than asked
-    for is refused."""
-    motions = [(file, motion) for file, known in _files(path) for motion in _read(file, known, fps)]
-    return [_fit(file, motion, character) for file, motion in motions]
+def read_clips(
+    path: Path,
+    character: str | None = None,
+    *,
+    fps: float | None = None,
+    dialect: str | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> list[Clip]:
+    """The motions of a path as clips that passed the gate (motion.check).
+
+    What has one right repair is repaired. A wrong unit, a wrong axis, feet deep under the floor and a root that leaps
+    are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Both repairs and what
+    stays in are said, a line each, to `say`. Recorded skeletons are then retargeted to `character`, "humanoid" when
+    None; clips of a robot or of a library stay what they are, and one of another character than asked for is refused.
+    The clips of a library have been through this when it was written.
+    """
+    found = []
+    for file, known in files_of(path):
+        for motion in read_file(file, known, fps=fps, dialect=dialect):
+            if known.name != OWN:
+                motion = _gated(file, motion, say)
+            found.append(_fit(file, motion, character))
+    return found
+
+
+def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]) -> Clip | SkeletonMotion:
+    mended, findings = mend(motion)
+    for finding in findings:
+        hopeless = finding.kind in ("up", "units", "floor") or finding.joint == "root position"
+        if finding.severity == "refused" and hopeless:
+            where = motion.name if finding.frame is None else f"{motion.name}, frame {finding.frame}"
+            raise FormatError(path, where, finding.message)
+    loud = [f for f in findings if f.severity != "note" or (f.kind == "floor" and abs(f.value or 0) > FLOOR_WRONG)]
+    if "guessed" in motion.source:
+        say(f"{motion.name}: {motion.source}")
+    for line in report(loud).splitlines()[:-1] if loud else ():
+        # What is refused there and leaps by a joint alone is let in here.
+        say(f"{motion.name}: {line.removeprefix('refused').strip()}")
+    return mended
 
 
 def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Clip:
     if isinstance(motion, SkeletonMotion):
         try:
-            return retarget(mend(motion)[0], character or "humanoid").clip
+            return retarget(motion, character or "humanoid").clip
         except RigError as error:
             raise FormatError(path, "skeleton", str(error)) from None
     if character not in (None, motion.character):
@@ -107,10 +143,10 @@ def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Cl
     return motion
 
 
-def _files(path: Path) -> list[tuple[Path, Format]]:
-    """The motion files at a path and their formats."""
+def files_of(path: Path) -> list[tuple[Path, Format]]:
+    """The motion files at a path, in it and in its folders, and their formats."""
     if path.is_dir():
-        named = [(file, _format(file)) for file in sorted(path.iterdir()) if file.is_file()]
+        named = [(file, _format(file)) for file in sorted(path.rglob("*")) if file.is_file()]
         files = [(file, known) for file, known in named if known]
         if not files:
             raise FormatError(path, "folder", f"holds no motion file; {_listing()}")
@@ -128,9 +164,18 @@ def _files(path: Path) -> list[tuple[Path, Format]]:
     return [(path, found)]
 
 
-def _read(path: Path, known: Format, fps: float | None) -> list[Clip | SkeletonMotion]:
-    motion = known.read(path, fps=fps) if known.rate else known.read(path)
-    return list(motion) if isinstance(motion, list) else [motion]
+def read_file(
+    path: Path, known: Format, *, fps: float | None = None, dialect: str | None = None
+) -> list[Clip | SkeletonMotion]:
+    """The motions of one file of a known format; see `read`."""
+    told = {name: value for name, value in (("fps", fps), ("dialect", dialect)) if name in known.untold}
+    motion = known.read(path, **told)
+    motions: list[Clip | SkeletonMotion] = [*motion] if isinstance(motion, list) else [motion]
+    for found in motions:
+        if not RATES[0] <= found.fps <= RATES[1]:
+            reason = f"{found.fps:.4g} frames per second; a motion has {RATES[0]:g} to {RATES[1]:g}"
+            raise FormatError(path, found.name, reason)
+    return motions
 
 
 def _format(path: Path) -> Format | None:

@@ -35,7 +35,7 @@ STRETCH = 100  # times the frames of the file: more than that does resampling no
 
 def is_deepmimic(path: Path) -> bool:
     """True when the file's first bytes look like this format."""
-    if path.suffix not in (".txt", ".json"):
+    if path.suffix.lower() not in (".txt", ".json"):
         return False
     with path.open("rb") as file:
         head = file.read(200)

@@ -185,6 +185,6 @@ def _columns(path: Path, header: list[str], values: np.ndarray) -> tuple[np.ndar
 def _by_ground(path: Path, root: np.ndarray, raw: np.ndarray, joints: np.ndarray, character: str) -> str:
     order = quaternion_order(root, raw, joints, character)
     if not order:
-        reason = "the motion fits x y z w and w x y z alike; say which: dialect='lafan1' or dialect='kimodo'"
+        reason = "the motion fits x y z w and w x y z alike; say which: --dialect lafan1 or kimodo (dialect=)"
         raise FormatError(path, "columns 3-6", reason)
     return next(name for name, dialect in DIALECTS.items() if dialect.order == order)

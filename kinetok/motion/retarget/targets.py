@@ -19,6 +19,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.retarget.body import Figure
 from kinetok.motion.retarget.source import SIDES, Actor, frame, stretches, to_quaternions, unit, upright
+from kinetok.motion.rigs import RigError
 
 FADE = 0.2  # s
 LEVELLING = 0.1  # s, the turn into and out of a level foot
@@ -72,6 +73,8 @@ def leg_ratio(actor: Actor, figure: Figure) -> float:
             bone = actor.places[f"{side}_{lower}"] - actor.places[f"{side}_{upper}"]
             theirs += float(np.linalg.norm(bone, axis=-1).mean())
             ours += figure.length[f"{side}_{upper}"]
+    if theirs < 0.1:
+        raise RigError(f"a leg of it is {theirs / 2:.3g} m long: its bones have no length")
     return ours / theirs
 
 

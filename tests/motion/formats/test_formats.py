@@ -1,6 +1,8 @@
-"""formats/__init__.py: every collected file reads, formats are told apart, and what is no motion is named or passed."""
+"""formats/__init__.py: every collected file reads, formats are told apart, what is no motion is named or passed, and
+what is read passes the gate."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,8 +61,9 @@ def test_a_folder_gives_what_is_motion_and_passes_the_rest(tmp_path, squat, data
     (tmp_path / "model.pkl").write_bytes(pickle.dumps({"weights": np.zeros(3)}))
     np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "folder.csv").mkdir()
+    write_robot_csv(tmp_path / "folder.csv" / "deep.csv", squat.clip())
     names = [motion.name for motion in read(tmp_path)]
-    assert names == ["one", "two", "b", "c_poses"]
+    assert names == ["one", "two", "b", "c_poses", "deep"]
 
 
 @pytest.mark.parametrize(
@@ -130,3 +133,49 @@ def test_a_skeleton_that_is_no_body(data_dir):
     path = data_dir / "bvh" / "edge" / "rotation_first_root.bvh"
     with pytest.raises(FormatError, match=r"rotation_first_root\.bvh: skeleton: .*cannot tell which joints are"):
         read_clips(path)
+
+
+def test_what_has_one_right_repair_is_repaired_and_said(tmp_path, squat):
+    raised = replace(squat.clip(), qpos=squat.clip().qpos + np.eye(36)[2] * 0.2)
+    write_robot_csv(tmp_path / "high.csv", raised)
+    said: list[str] = []
+    (clip,) = read_clips(tmp_path / "high.csv", say=said.append)
+    assert abs(clip.qpos[:, 2] - squat.clip().qpos[:, 2]).max() < 0.01
+    assert said == ["high: fixed   floor    the feet stand +0.200 m over the floor all the time; shifted onto it"]
+    ClipLibrary.write(tmp_path / "own.safetensors", [raised])  # has been through it, or is meant so
+    (own,) = read_clips(tmp_path / "own.safetensors", say=said.append)
+    assert abs(own.qpos - raised.qpos).max() < 1e-5 and len(said) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda qpos: qpos[:, :3] * 100, "high on a body of 1.05 m: its position is in another unit"),
+        (lambda qpos: qpos[:, :3] + np.linspace(0, 160, len(qpos))[:, None] * [1, 0, 0], "the root moves at 30"),
+        (lambda qpos: qpos[:, :3] - np.linspace(0.4, 0.8, len(qpos))[:, None] * [0, 0, 1], "under the floor, as where"),
+    ],
+    ids=["unit", "leap", "axes"],
+)
+def test_what_no_repair_helps_is_refused_and_named(tmp_path, squat, change, reason):
+    clip = squat.clip()
+    qpos = np.concatenate([clip.qpos] * 4)
+    qpos[:, :3] = change(qpos)
+    write_robot_csv(tmp_path / "odd.csv", replace(clip, qpos=qpos))
+    with pytest.raises(FormatError, match=rf"odd\.csv: odd.*{reason}"):
+        read_clips(tmp_path / "odd.csv", dialect="lafan1")
+
+
+def test_a_joint_that_leaps_is_said_and_let_in(data_dir):
+    said: list[str] = []
+    assert len(read_clips(data_dir / "bvh" / "fair1" / "dab.bvh", say=said.append)) == 1
+    assert any(line.startswith("dab: jump") and "cut it there or leave it out" in line for line in said)
+
+
+@pytest.mark.parametrize("fps", [0.001, 2000.0])
+def test_no_motion_has_such_a_rate(tmp_path, data_dir, fps):
+    (poses,) = read(data_dir / "smpl" / "synthetic_run_09_01_poses.npz")
+    write_amass(tmp_path / "odd_poses.npz", replace(poses, fps=fps))
+    with pytest.raises(
+        FormatError, match=rf"odd_poses\.npz: odd_poses: {fps:.4g} frames per second; a motion has 1 to"
+    ):
+        read(tmp_path / "odd_poses.npz")

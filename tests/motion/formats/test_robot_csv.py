@@ -79,7 +79,7 @@ def test_a_motion_that_fits_both_orders_needs_a_dialect(tmp_path):
     path = tmp_path / "still.csv"
     path.write_text("\n".join([",".join(["0", "0", "0.79", "0", "0", "0", "1"] + ["0"] * 29)] * 5))
     with pytest.raises(
-        FormatError, match="columns 3-6: the motion fits x y z w and w x y z alike; say which: dialect="
+        FormatError, match="columns 3-6: the motion fits x y z w and w x y z alike; say which: --dialect"
     ):
         read_robot_csv(path)
     assert read_robot_csv(path, dialect="lafan1").qpos[0, 3] == 1
