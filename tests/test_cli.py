@@ -151,6 +151,19 @@ def test_clips_check_goes_on_past_what_it_cannot_read(data_dir, tmp_path):
     assert kinetok("clips", "check", tmp_path / "a", tmp_path / "c").exit_code == 0  # a copy alone is no fault
 
 
+def test_a_library_grows_and_is_parted(clip, tmp_path):
+    others = [write_clip(tmp_path / "more" / f"c{number}.txt", frames(11)) for number in range(9)]
+    out = tmp_path / "all.safetensors"
+    assert kinetok("clips", "import", clip, "--half", "--out", out).exit_code == 0
+    assert kinetok("clips", "import", *others, "--append", "--out", out).output.startswith(f"added to {out}: 9 clips")
+    assert len(read_clips(out)) == 10
+    assert kinetok("clips", "split", out, "--share", 0.3, "--mirror", "--out", tmp_path / "parts").exit_code == 0
+    train, held = (read_clips(tmp_path / "parts" / f"{name}.safetensors") for name in ("train", "held_out"))
+    assert len(train) + len(held) == 20 and held and not {c.source for c in train} & {c.source for c in held}
+    wrong = kinetok("clips", "split", out, "--share", 1.5, "--out", tmp_path / "none")
+    assert wrong.exit_code == 1 and "between 0 and 1" in wrong.output and not (tmp_path / "none").exists()
+
+
 def test_a_library_is_of_one_body(clip, data_dir, tmp_path):
     robot, out = data_dir / "g1" / "kimodo_wxyz" / "kimodo_walk.csv", tmp_path / "both.safetensors"
     result = kinetok("clips", "import", clip, robot, "--out", out)
