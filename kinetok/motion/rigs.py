@@ -32,8 +32,8 @@ class Rig:
 
 
 def _table(pelvis: str, head: str, sides: tuple[str, str], **limbs: str) -> dict[str, str]:
-    """Part -> joint name; {} in a limb's name stands for the side's spelling."""
-    named = {"pelvis": pelvis, "head": head}
+    """Part -> joint name; {} in a limb's name stands for the side's spelling. A body without a head names none."""
+    named = {"pelvis": pelvis} | ({"head": head} if head else {})
     for side, spelling in zip(("left", "right"), sides, strict=True):
         named |= {f"{side}_{limb}": name.format(spelling) for limb, name in limbs.items()}
     return named
@@ -81,6 +81,12 @@ RIGS: dict[str, dict[str, str]] = {
         "pelvis", "head", ("left", "right"),
         thigh="{}_thigh", shin="{}_shin", foot="{}_foot",
         upper_arm="{}_upper_arm", lower_arm="{}_lower_arm", hand="{}_hand",
+    ),
+    # the G1's links, as exported here: of three hinges in a row the one at the upper end of the limb
+    "unitree": _table(
+        "pelvis", "", ("left", "right"),
+        thigh="{}_hip_roll_link", shin="{}_knee_link", foot="{}_ankle_roll_link",
+        upper_arm="{}_shoulder_roll_link", lower_arm="{}_elbow_link", hand="{}_wrist_yaw_link",
     ),
 }  # fmt: skip
 

@@ -273,3 +273,13 @@ def test_tokens_are_decoded_for_other_programs(tmp_path):
         motion = read(out)
         assert f"wrote {out}: {len(motion.root)} frames at 30 fps" in result.output
         assert motion.joints[0] == "pelvis" and len(motion.root) > 5
+
+
+def test_a_robot_in_a_bvh_comes_back(data_dir, tmp_path):
+    walk = read_robot_csv(data_dir / "g1" / "kimodo_wxyz" / "kimodo_walk.csv")
+    write_bvh(tmp_path / "walk.bvh", skeleton_motion(Character.load("g1"), walk))
+    motion = read_bvh(tmp_path / "walk.bvh")
+    back = retarget(motion, "g1")
+    assert back.report.rig == "family unitree" and abs(back.report.scale - 1) < 0.02
+    assert back.report.residual_mean < 0.01
+    assert abs(back.clip.qpos[:, :3] - walk.qpos[: len(back.clip.qpos), :3]).max() < 0.1
