@@ -61,7 +61,7 @@ def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character:
     """
     from kinetok.motion.check import check, report
     from kinetok.motion.duplicates import duplicates
-    from kinetok.motion.formats import FormatError, files_of, read_file
+    from kinetok.motion.formats import SAID, FormatError, files_of, read_file
 
     if fix != (out is not None):
         raise ValueError("--fix writes what it repairs: give both --fix and --out F.safetensors")
@@ -82,6 +82,7 @@ def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character:
     good = []
     for label, (_, motion) in zip(labels, read, strict=True):
         findings = check(motion)
+        label += f" from {motion.source}" if any(word in motion.source for word in SAID) else ""
         good.append(not any(f.severity == "refused" for f in findings))
         click.echo(f"{label}\n  " + report(findings).replace("\n", "\n  "))
     left_out += [label for label, kept in zip(labels, good, strict=True) if not kept]

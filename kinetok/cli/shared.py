@@ -98,11 +98,7 @@ def load_clips(
     def say(line: str) -> None:
         click.echo(line, err=True)
 
-    found = [clip for path in paths for clip in read_clips(path, character, fps=fps, dialect=dialect, say=say)]
-    for clip in found:
-        if "assumed" in clip.source:
-            say(f"{clip.name}: {clip.source}")
-    return found
+    return [clip for path in paths for clip in read_clips(path, character, fps=fps, dialect=dialect, say=say)]
 
 
 def check_suffix(out: Path, *allowed: str) -> None:

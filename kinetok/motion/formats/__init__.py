@@ -57,6 +57,7 @@ class Format:
 
 RATES = (1.0, 1000.0)  # frames per second that a recording may have
 OWN = "kinetok"
+SAID = ("assumed", "guessed", "made unit")  # of what a reader did that is worth a line
 FORMATS = (
     Format("DeepMimic", (".txt", ".json"), is_deepmimic, read_deepmimic),
     Format(OWN, (".safetensors",), by_suffix, read_library),
@@ -123,7 +124,7 @@ def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]
             where = motion.name if finding.frame is None else f"{motion.name}, frame {finding.frame}"
             raise FormatError(path, where, finding.message)
     loud = [f for f in findings if f.severity != "note" or (f.kind == "floor" and abs(f.value or 0) > FLOOR_WRONG)]
-    if "guessed" in motion.source:
+    if any(word in motion.source for word in SAID):
         say(f"{motion.name}: {motion.source}")
     for line in report(loud).splitlines()[:-1] if loud else ():
         # What is refused there and leaps by a joint alone is let in here.

@@ -29,6 +29,7 @@ JOINTS = (
     ("left_hip", 4, 0), ("left_knee", 1, -1), ("left_ankle", 4, 0), ("left_shoulder", 4, 0), ("left_elbow", 1, 1),
 )  # fmt: skip
 CLOSE_SECONDS = 0.25
+NORM_OFF = 0.05  # the files' three or four digits leave less
 LARGEST = 1e6
 STRETCH = 100  # times the frames of the file: more than that does resampling not make
 
@@ -57,8 +58,8 @@ def read_deepmimic(path: Path, *, close: bool = True) -> Clip:
     if loop and close:
         qpos = close_loop(body, qpos, max(1, round(CLOSE_SECONDS * fps)))
     qpos[:, 2] -= floor_height(body, qpos, fps, loop=loop and close)
-    name = path.stem.removeprefix("humanoid3d_")
-    return Clip(name=name, character="humanoid", fps=fps, qpos=qpos, loop=loop, source=str(path.name))
+    name, source = path.stem.removeprefix("humanoid3d_"), path.name + _renormed(frames[:, 1:])
+    return Clip(name=name, character="humanoid", fps=fps, qpos=qpos, loop=loop, source=source)
 
 
 def _parse(path: Path) -> tuple[bool, np.ndarray]:
@@ -103,6 +104,20 @@ def _unit(path: Path, q: np.ndarray, column: int) -> np.ndarray:
         raise FormatError(path, f"frame {frame}, columns {column}-{column + 3}", "a zero quaternion is no rotation")
     w, x, y, z = (q / norm[:, None]).T
     return rotation.align(np.stack([w, x, -z, y], axis=1))  # y up to z up
+
+
+def _renormed(values: np.ndarray) -> str:
+    """What to say of quaternions that are not unit in the file; nothing of those that are within NORM_OFF."""
+    columns, at = [3], 7
+    for _, width, _ in JOINTS:
+        columns += [at] if width == 4 else []
+        at += width
+    norms = np.stack([np.linalg.norm(values[:, at : at + 4], axis=1) for at in columns], axis=1)
+    frame, worst = np.unravel_index(np.abs(norms - 1).argmax(), norms.shape)
+    if abs(norms[frame, worst] - 1) < NORM_OFF:
+        return ""
+    place = f"frame {frame}, columns {columns[worst] + 1}-{columns[worst] + 4}"
+    return f" (quaternions made unit, the furthest of norm {norms[frame, worst]:.2f} in {place})"
 
 
 def _to_qpos(path: Path, body: Character, values: np.ndarray) -> np.ndarray:

@@ -42,9 +42,19 @@ def test_every_collected_file(data_dir):
     files = [path for path in data_dir.rglob("*") if path.suffix in suffixes]
     files += list(data_dir.glob("train/deepmimic*/*.txt"))
     assert len(files) == 77
+    refused = []
     for path in files:
         (motion,) = read(path)
         assert facts(motion)[1] >= 2, path
+        try:
+            (clip,) = read_clips(path)  # what `kinetok clips import` does
+        except FormatError as error:
+            refused.append((path.name, str(error).partition(": ")[2]))
+            continue
+        assert np.isfinite(clip.qpos).all() and clip.seconds > 0.4, path
+    # made by hand to try a parser: a chain of 0.12 m, and no limbs
+    assert [name for name, _ in refused] == ["full_precision_frame_time.bvh", "rotation_first_root.bvh"], refused
+    assert "the body is 0.12 m large" in refused[0][1] and "cannot tell which joints" in refused[1][1]
 
 
 def test_a_folder_gives_what_is_motion_and_passes_the_rest(tmp_path, squat, data_dir):
@@ -141,10 +151,13 @@ def test_what_has_one_right_repair_is_repaired_and_said(tmp_path, squat):
     said: list[str] = []
     (clip,) = read_clips(tmp_path / "high.csv", say=said.append)
     assert abs(clip.qpos[:, 2] - squat.clip().qpos[:, 2]).max() < 0.01
-    assert said == ["high: fixed   floor    the feet stand +0.200 m over the floor all the time; shifted onto it"]
+    assert said == [
+        "high: high.csv (lafan1 by the ground, 30 fps assumed)",
+        "high: fixed   floor    the feet stand +0.200 m over the floor all the time; shifted onto it",
+    ]
     ClipLibrary.write(tmp_path / "own.safetensors", [raised])  # has been through it, or is meant so
     (own,) = read_clips(tmp_path / "own.safetensors", say=said.append)
-    assert abs(own.qpos - raised.qpos).max() < 1e-5 and len(said) == 1
+    assert abs(own.qpos - raised.qpos).max() < 1e-5 and len(said) == 2
 
 
 @pytest.mark.parametrize(
