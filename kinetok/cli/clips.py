@@ -129,7 +129,9 @@ def write_fixed(out: Path, motions: list, left_out: list[str], character: str | 
     type=PATHS,
     help="The library to write, ending in .safetensors; with --append also a folder of parts.",
 )
-@click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
+@click.option(
+    "--character", default=None, help="Body to retarget to.  [default: humanoid for skeletons, for clips their own]"
+)
 @option_fps
 @option_dialect
 @click.option("--half", is_flag=True, default=False, show_default=True, help="Half the bytes (float16), 0.7 mm off.")
@@ -144,7 +146,7 @@ def clips_import(
 
     \b
     BVH, ASF/AMC, AMASS npz, poselib npy          retargeted to --character
-    DeepMimic txt, robot CSV, MimicKit, GMR, ...  of the body they were made for
+    DeepMimic txt, robot CSV, MimicKit, GMR, ...  of the body they were made for, or retargeted to --character
     """
     from kinetok.motion.library import ClipLibrary
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from kinetok.motion.character import Character
 from kinetok.motion.check import FLOOR_WRONG, mend, report
 from kinetok.motion.clip import Clip
 from kinetok.motion.error import FormatError
@@ -104,8 +105,8 @@ def read_clips(
     What has one right repair is repaired. A wrong unit, a wrong axis, feet deep under the floor and a root that leaps
     are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Both repairs and what
     stays in are said, a line each, to `say`. Recorded skeletons are then retargeted to `character`, "humanoid" when
-    None; clips of a robot or of a library stay what they are, and one of another character than asked for is refused.
-    The clips of a library have been through this when it was written.
+    None, and so are clips of another body, if one is asked for. The clips of a library have been through the gate when
+    it was written.
     """
     found = []
     for file, known in files_of(path):
@@ -133,15 +134,24 @@ def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]
 
 
 def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Clip:
-    if isinstance(motion, SkeletonMotion):
-        try:
+    try:
+        if isinstance(motion, SkeletonMotion):
             return retarget(motion, character or "humanoid").clip
-        except RigError as error:
-            raise FormatError(path, "skeleton", str(error)) from None
-    if character not in (None, motion.character):
-        reason = f"is a motion of {motion.character!r}; only recorded skeletons are retargeted to {character!r}"
-        raise FormatError(path, motion.name, reason)
-    return motion
+        if character in (None, motion.character):
+            return motion
+        return _on_another(motion, character)
+    except RigError as error:
+        raise FormatError(path, "skeleton", str(error)) from None
+
+
+def _on_another(clip: Clip, character: str) -> Clip:
+    """A clip of one body on another, by way of its skeleton; a loop becomes one cycle."""
+    from kinetok.motion.export import skeleton_motion  # which writes what is read here
+
+    body = Character.load(clip.character)
+    skeleton = skeleton_motion(body, clip)
+    parts = {part: body.body_names[index] for part, index in body.parts.items()}
+    return retarget(skeleton, character, parts=None if clip.character == "g1" else parts).clip  # rigs.py knows the G1
 
 
 def files_of(path: Path) -> list[tuple[Path, Format]]:

@@ -38,6 +38,7 @@ def test_every_format_of_the_collection(data_dir):
 
 
 def test_every_collected_file(data_dir):
+    pytest.importorskip("mink")
     suffixes = {suffix for known in FORMATS for suffix in known.suffixes} - {".txt", ".json"}
     files = [path for path in data_dir.rglob("*") if path.suffix in suffixes]
     files += list(data_dir.glob("train/deepmimic*/*.txt"))
@@ -121,13 +122,16 @@ def test_the_rate_of_files_that_name_none(tmp_path, squat):
     assert [clip.fps for clip in read_clips(tmp_path)] == [30, 30]
 
 
-def test_robot_clips_stay_with_the_robot(tmp_path, squat):
-    write_robot_csv(tmp_path / "a.csv", squat.clip())
-    assert read_clips(tmp_path / "a.csv")[0].character == read_clips(tmp_path, "g1")[0].character == "g1"
-    with pytest.raises(
-        FormatError, match=r"a\.csv: a: is a motion of 'g1'; only recorded skeletons are retargeted to 'hum"
-    ):
-        read_clips(tmp_path, "humanoid")
+def test_robot_clips_stay_with_the_robot_unless_another_body_is_asked_for(tmp_path, data_dir):
+    pytest.importorskip("mink")
+    robot, person = data_dir / "g1" / "kimodo_wxyz" / "kimodo_walk.csv", data_dir / "train" / "deepmimic"
+    assert read_clips(robot)[0].character == read_clips(robot, "g1")[0].character == "g1"
+    for path, character, upright in ((robot, "humanoid", 0.75), (person / "humanoid3d_walk.txt", "g1", 0.65)):
+        (own,), (other,) = read_clips(path), read_clips(path, character)
+        assert other.character == character and abs(other.seconds - own.seconds) < 0.05
+        assert other.qpos[:, 2].min() > upright
+        walked = [np.linalg.norm(clip.qpos[-1, :2] - clip.qpos[0, :2]) for clip in (own, other)]
+        assert 0.6 < walked[1] / walked[0] < 1.7  # by the ratio of the legs
 
 
 def test_skeletons_are_retargeted(data_dir):
@@ -179,6 +183,7 @@ def test_what_no_repair_helps_is_refused_and_named(tmp_path, squat, change, reas
 
 
 def test_a_joint_that_leaps_is_said_and_let_in(data_dir):
+    pytest.importorskip("mink")
     said: list[str] = []
     assert len(read_clips(data_dir / "bvh" / "fair1" / "dab.bvh", say=said.append)) == 1
     assert any(line.startswith("dab: jump") and "cut it there or leave it out" in line for line in said)
