@@ -11,7 +11,7 @@ character whose bodies slide, for a skeleton's bones have a fixed length.
 
 SMPL's: the directions of thighs, shins and arms are the character's, and so are the turns about them, told by the axes
 of knees and elbows, and the orientations of pelvis, chest, head, feet and hands. The lengths are those of the average
-body of formats/amass.py; the path is scaled by the ratio of the legs and raised so that a level sole stays where it
+body of motion/smpl.py; the path is scaled by the ratio of the legs and raised so that a level sole stays where it
 is. Spine and neck share the bend between their ends; collars go with the chest, toes with the feet, and the head with
 the chest where the character has none. Refused: a character that does not name its parts.
 
@@ -23,15 +23,15 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
-from kinetok.motion.formats.amass import JOINTS, OFFSETS, PARENTS
 from kinetok.motion.kinematics import kinematics
 from kinetok.motion.retarget.body import Figure, measure
 from kinetok.motion.retarget.source import LIMBS, SIDES, frame, to_quaternions, upright
 from kinetok.motion.rigs import RIGS
 from kinetok.motion.skeleton import SkeletonMotion
+from kinetok.motion.smpl import JOINTS, OFFSETS, PARENTS
 
 TOLERANCE = 1e-6  # metres
-ANKLE = 0.08  # metres: of an adult with the offsets of formats/amass.py, standing; ours, like them
+ANKLE = 0.08  # metres: of an adult with the offsets of motion/smpl.py, standing; ours, like them
 AHEAD, LEFT, UP = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])  # of SMPL's T-pose
 
 
@@ -70,7 +70,7 @@ def skeleton_motion(character: Character, clip: Clip) -> SkeletonMotion:
 
 
 def smpl_motion(character: Character, clip: Clip) -> SkeletonMotion:
-    """The clip as SMPL's 22 joints in the proportions of formats/amass.py: T frames, metres, z up.
+    """The clip as SMPL's 22 joints in the proportions of motion/smpl.py: T frames, metres, z up.
 
     Joint rotation in the world = (frame of the part now) (frame of SMPL's part in the T-pose)^-1, with the frames of
     retarget/source.py: along the bone and the axis of flexion for limbs; ahead, left and up for the others.

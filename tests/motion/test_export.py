@@ -12,12 +12,12 @@ from kinetok.motion.character import Character, from_mjcf
 from kinetok.motion.clip import Clip
 from kinetok.motion.export import ANKLE, skeleton_motion, smpl_motion
 from kinetok.motion.formats import read_amass, read_bvh, read_robot_csv, write_amass, write_bvh
-from kinetok.motion.formats.amass import OFFSETS, PARENTS
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.library import ClipLibrary
 from kinetok.motion.retarget import retarget
 from kinetok.motion.retarget.body import measure
 from kinetok.motion.skeleton import SkeletonMotion
+from kinetok.motion.smpl import OFFSETS, PARENTS
 
 OFF_CENTRE = """
 <mujoco model="off">

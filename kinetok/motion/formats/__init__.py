@@ -17,6 +17,7 @@ from kinetok.motion.character import Character
 from kinetok.motion.check import FLOOR_WRONG, mend, report
 from kinetok.motion.clip import Clip
 from kinetok.motion.error import FormatError
+from kinetok.motion.export import skeleton_motion
 from kinetok.motion.formats.amass import is_amass, read_amass, write_amass
 from kinetok.motion.formats.asf_amc import read_amc
 from kinetok.motion.formats.bvh import read_bvh, write_bvh
@@ -146,8 +147,6 @@ def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Cl
 
 def _on_another(clip: Clip, character: str) -> Clip:
     """A clip of one body on another, by way of its skeleton; a loop becomes one cycle."""
-    from kinetok.motion.export import skeleton_motion  # which writes what is read here
-
     body = Character.load(clip.character)
     skeleton = skeleton_motion(body, clip)
     parts = {part: body.body_names[index] for part, index in body.parts.items()}

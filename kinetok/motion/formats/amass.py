@@ -5,7 +5,7 @@
 
 z up, metres, axis-angle. Read are the 22 body joints and the root's path: poses (T, 72, 156 or 165) begins with them;
 without it root_orient (T, 3) and pose_body (T, 63); trans (T, 3); mocap_framerate or mocap_frame_rate. Hands, face
-and soft tissue are left out. The body is always the average one of OFFSETS: betas and gender are ignored, since
+and soft tissue are left out. The body is always the average one of motion.smpl: betas and gender are ignored, since
 making the subject's own skeleton of them takes the SMPL model, which we do not have. trans is taken as the pelvis;
 SMPL's lies a constant few centimetres from it.
 """
@@ -20,28 +20,8 @@ from kinetok.motion.error import FormatError
 from kinetok.motion.formats.archive import ZipArrays
 from kinetok.motion.formats.fields import array, rate
 from kinetok.motion.skeleton import SkeletonMotion
+from kinetok.motion.smpl import JOINTS, OFFSETS, PARENTS
 
-# SMPL's body joints: name, parent, and the joint in its parent's frame in the T-pose: y up, facing z, left is x.
-# The metres are our own round numbers for an adult of 1.7 m, not those of the SMPL model.
-SKELETON = (
-    ("pelvis", "", (0, 0, 0)),
-    ("left_hip", "pelvis", (0.085, -0.08, 0)), ("right_hip", "pelvis", (-0.085, -0.08, 0)),
-    ("spine1", "pelvis", (0, 0.11, -0.01)),
-    ("left_knee", "left_hip", (0.01, -0.41, 0)), ("right_knee", "right_hip", (-0.01, -0.41, 0)),
-    ("spine2", "spine1", (0, 0.13, 0)),
-    ("left_ankle", "left_knee", (0, -0.41, -0.02)), ("right_ankle", "right_knee", (0, -0.41, -0.02)),
-    ("spine3", "spine2", (0, 0.06, 0.01)),
-    ("left_foot", "left_ankle", (0.02, -0.06, 0.13)), ("right_foot", "right_ankle", (-0.02, -0.06, 0.13)),
-    ("neck", "spine3", (0, 0.21, -0.02)),
-    ("left_collar", "spine3", (0.07, 0.11, -0.01)), ("right_collar", "spine3", (-0.07, 0.11, -0.01)),
-    ("head", "neck", (0, 0.09, 0.03)),
-    ("left_shoulder", "left_collar", (0.1, 0.03, -0.01)), ("right_shoulder", "right_collar", (-0.1, 0.03, -0.01)),
-    ("left_elbow", "left_shoulder", (0.28, 0, 0)), ("right_elbow", "right_shoulder", (-0.28, 0, 0)),
-    ("left_wrist", "left_elbow", (0.25, 0, 0)), ("right_wrist", "right_elbow", (-0.25, 0, 0)),
-)  # fmt: skip
-JOINTS = tuple(name for name, _, _ in SKELETON)
-PARENTS = tuple(JOINTS.index(parent) if parent else -1 for _, parent, _ in SKELETON)
-OFFSETS = np.array([offset for _, _, offset in SKELETON], dtype=np.float64)
 BODY = 3 * len(JOINTS)
 WIDTHS = (72, 156, 165)  # of poses: SMPL, SMPL-H, SMPL-X
 RATES = ("mocap_framerate", "mocap_frame_rate")

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kinetok.motion.formats import FormatError, read, read_amass, write_amass
-from kinetok.motion.formats.amass import JOINTS, OFFSETS, PARENTS
 from kinetok.motion.skeleton import SkeletonMotion
+from kinetok.motion.smpl import JOINTS, OFFSETS, PARENTS
 
 RNG = np.random.default_rng(0)
 UPRIGHT = np.array([np.pi / 2, 0, 0])  # y up to z up: a standing body's root in AMASS

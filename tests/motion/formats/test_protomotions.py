@@ -12,11 +12,11 @@ import torch
 
 from kinetok import rotation
 from kinetok.motion.formats import FormatError, SkeletonMotion, read, read_protomotions
-from kinetok.motion.formats.amass import JOINTS as SMPL_JOINTS
-from kinetok.motion.formats.amass import OFFSETS
 from kinetok.motion.formats.g1 import load_g1
 from kinetok.motion.formats.protomotions import SMPL
 from kinetok.motion.kinematics import kinematics
+from kinetok.motion.smpl import JOINTS as SMPL_JOINTS
+from kinetok.motion.smpl import OFFSETS
 
 RNG = np.random.default_rng(0)
 
