@@ -29,7 +29,7 @@ from kinetok.motion.formats.poselib import is_poselib, read_poselib
 from kinetok.motion.formats.protomotions import read_protomotions
 from kinetok.motion.formats.robot_csv import is_robot_csv, read_robot_csv, write_robot_csv
 from kinetok.motion.library import ClipLibrary
-from kinetok.motion.retarget import retarget
+from kinetok.motion.retarget import Retargeted, retarget
 from kinetok.motion.rigs import RigError
 from kinetok.motion.skeleton import SkeletonMotion
 
@@ -104,17 +104,17 @@ def read_clips(
     """The motions of a path as clips that passed the gate (motion.check).
 
     What has one right repair is repaired. A wrong unit, a wrong axis, feet deep under the floor and a root that leaps
-    are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Both repairs and what
-    stays in are said, a line each, to `say`. Recorded skeletons are then retargeted to `character`, "humanoid" when
-    None, and so are clips of another body, if one is asked for. The clips of a library have been through the gate when
-    it was written.
+    are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Recorded skeletons are then
+    retargeted to `character`, "humanoid" when None, and so are clips of another body, if one is asked for. `say` is told
+    of all this, a line each: what was repaired, what stays in, how well a motion was retargeted. The clips of a library
+    have been through the gate when it was written.
     """
     found = []
     for file, known in files_of(path):
         for motion in read_file(file, known, fps=fps, dialect=dialect):
             if known.name != OWN:
                 motion = _gated(file, motion, say)
-            found.append(_fit(file, motion, character))
+            found.append(_fit(file, motion, character, say))
     return found
 
 
@@ -134,23 +134,30 @@ def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]
     return mended
 
 
-def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None) -> Clip:
+def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None, say: Callable[[str], None]) -> Clip:
     try:
         if isinstance(motion, SkeletonMotion):
-            return retarget(motion, character or "humanoid").clip
-        if character in (None, motion.character):
+            fitted = retarget(motion, character or "humanoid")
+        elif character in (None, motion.character):
             return motion
-        return _on_another(motion, character)
+        else:
+            fitted = _on_another(motion, character)
     except RigError as error:
         raise FormatError(path, "skeleton", str(error)) from None
+    found, mm = fitted.report, 1000
+    say(
+        f"{found.name}: on {fitted.clip.character} ({found.rig}), joints {mm * found.residual_mean:.0f} mm from their "
+        f"targets, {mm * found.residual_max:.0f} at most; standing feet slide by {found.skate:.2f} m/s"
+    )
+    return fitted.clip
 
 
-def _on_another(clip: Clip, character: str) -> Clip:
+def _on_another(clip: Clip, character: str) -> Retargeted:
     """A clip of one body on another, by way of its skeleton; a loop becomes one cycle."""
     body = Character.load(clip.character)
     skeleton = skeleton_motion(body, clip)
     parts = {part: body.body_names[index] for part, index in body.parts.items()}
-    return retarget(skeleton, character, parts=None if clip.character == "g1" else parts).clip  # rigs.py knows the G1
+    return retarget(skeleton, character, parts=None if clip.character == "g1" else parts)  # rigs.py knows the G1
 
 
 def files_of(path: Path) -> list[tuple[Path, Format]]:

@@ -187,6 +187,7 @@ def test_a_joint_that_leaps_is_said_and_let_in(data_dir):
     said: list[str] = []
     assert len(read_clips(data_dir / "bvh" / "fair1" / "dab.bvh", say=said.append)) == 1
     assert any(line.startswith("dab: jump") and "cut it there or leave it out" in line for line in said)
+    assert said[-1].startswith("dab: on humanoid (family fair1), joints ") and "feet slide by 0.0" in said[-1]
 
 
 @pytest.mark.parametrize("fps", [0.001, 2000.0])
