@@ -105,7 +105,7 @@ def read_clips(
 
     What has one right repair is repaired. A wrong unit, a wrong axis, feet deep under the floor and a root that leaps
     are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Recorded skeletons are then
-    retargeted to `character`, "humanoid" when None, and so are clips of another body, if one is asked for. `say` is told
+    retargeted to `character`, "humanoid" when None, and so are clips of another body, if one is asked for. `say` hears
     of all this, a line each: what was repaired, what stays in, how well a motion was retargeted. The clips of a library
     have been through the gate when it was written.
     """
