@@ -150,7 +150,8 @@ def clips_import(
     """
     from kinetok.motion.library import ClipLibrary
 
-    check_suffix(out, ".safetensors", *([""] if append else []))
+    if out.suffix or not append:
+        check_suffix(out, ".safetensors")
     found = load_clips(paths, character, fps, dialect)
     bodies = sorted({clip.character for clip in found})
     if len(bodies) > 1:

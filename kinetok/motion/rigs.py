@@ -108,7 +108,7 @@ CENTRAL = ("pelvis", "head")
 def find_rig(motion: SkeletonMotion, parts: dict[str, str] | None = None) -> Rig:
     """Tell the parts of a skeleton. parts: part -> joint name, given by the user; they win over every table."""
     given = _given(motion, parts or {})
-    family, table = _known(motion)
+    family, table = known_family(motion)
     found = dict(table) if table else _by_words(motion.joints)
     found = {part: motion.joints.index(name) for part, name in found.items()} | given
     missing = [part for part in REQUIRED if part not in found]
@@ -132,7 +132,7 @@ def _given(motion: SkeletonMotion, parts: dict[str, str]) -> dict[str, int]:
     return {part: motion.joints.index(name) for part, name in parts.items()}
 
 
-def _known(motion: SkeletonMotion) -> tuple[str, dict[str, str]]:
+def known_family(motion: SkeletonMotion) -> tuple[str, dict[str, str]]:
     """The family whose every joint is there: the motion's own first, then the table in order."""
     full = {name.rpartition(":")[2]: name for name in motion.joints}  # "mixamorig:Hips"
     for family in (motion.family, *RIGS):

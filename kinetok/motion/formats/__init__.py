@@ -30,7 +30,7 @@ from kinetok.motion.formats.protomotions import read_protomotions
 from kinetok.motion.formats.robot_csv import is_robot_csv, read_robot_csv, write_robot_csv
 from kinetok.motion.library import ClipLibrary
 from kinetok.motion.retarget import Retargeted, retarget
-from kinetok.motion.rigs import RigError
+from kinetok.motion.rigs import RigError, known_family
 from kinetok.motion.skeleton import SkeletonMotion
 
 
@@ -157,7 +157,8 @@ def _on_another(clip: Clip, character: str) -> Retargeted:
     body = Character.load(clip.character)
     skeleton = skeleton_motion(body, clip)
     parts = {part: body.body_names[index] for part, index in body.parts.items()}
-    return retarget(skeleton, character, parts=None if clip.character == "g1" else parts)  # rigs.py knows the G1
+    family, _ = known_family(skeleton)  # its table says where a limb begins, roles which body turns with it
+    return retarget(skeleton, character, parts=None if family else parts)
 
 
 def files_of(path: Path) -> list[tuple[Path, Format]]:
