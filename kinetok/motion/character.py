@@ -1,7 +1,7 @@
 """A character: any MJCF read once, with the names, addresses, limits, gains and roles the rest of kinetok needs.
 
     humanoid = Character.load("humanoid")          # built in, see characters()
-    robot = Character.load("my_robot.xml")         # roles in my_robot.json beside it, optional
+    robot = Character.load("my_robot.xml")         # roles in my_robot.json beside it, optional; see known_roles
     talos = Character.load("menagerie:pal_talos")  # with the package mujoco-menagerie, which downloads it
     humanoid.body_names, humanoid.nu, humanoid.kp, humanoid.parts["left_shin"], humanoid.mirror_qpos(qpos)
 
@@ -12,7 +12,7 @@ actuators, an actuator without a position gain, a floor. It does not know clips,
 
 import functools
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -78,7 +78,8 @@ class Character:
         if not path.exists():
             raise FileNotFoundError(f"{path}: no such MJCF file")
         roles = path.with_suffix(".json")
-        return from_mjcf(path.stem, read_mjcf(path), read_roles(roles) if roles.exists() else {}, str(roles))
+        found = from_mjcf(path.stem, read_mjcf(path), read_roles(roles) if roles.exists() else {}, str(roles))
+        return found if roles.exists() else replace(found, roles=known_roles(found.model))
 
     @property
     def nq(self) -> int:
@@ -197,6 +198,19 @@ def from_mjcf(name: str, xml: str, roles: dict, roles_file: str = "roles") -> Ch
         hinge=hinge,
         dof=dof,
     )
+
+
+def known_roles(model: mujoco.MjModel) -> dict:
+    """The roles of the built-in character all of whose bodies and joints a model has, as the Unitree G1 of the
+    menagerie, of mjlab and of others has; {} where there is none."""
+    for name in BUILT_IN:
+        roles = read_roles(ASSETS / f"{name}.json")
+        try:
+            check_roles(roles, model, name)
+        except ConfigError:
+            continue
+        return roles
+    return {}
 
 
 def read_mjcf(path: Path) -> str:

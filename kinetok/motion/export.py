@@ -23,7 +23,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
-from kinetok.motion.kinematics import kinematics
+from kinetok.motion.kinematics import joint_anchors, kinematics
 from kinetok.motion.retarget.body import Figure, measure
 from kinetok.motion.retarget.source import LIMBS, SIDES, frame, to_quaternions, upright
 from kinetok.motion.rigs import RIGS
@@ -39,7 +39,7 @@ def skeleton_motion(character: Character, clip: Clip) -> SkeletonMotion:
     """The clip as joints: T frames, one joint per body, metres, z up; family is the character's name."""
     _check_columns(character, clip)
     poses = kinematics(character, np.concatenate([character.model.qpos0[None], clip.qpos]), clip.fps)
-    anchors = np.array([_anchor(character, body) for body in range(1, character.model.nbody)])
+    anchors = joint_anchors(character)
     points = poses.xpos + rotation.rotate(poses.xquat, anchors)
     turned = rotation.multiply(poses.xquat[1:], rotation.conjugate(poses.xquat[:1]))
     local, offsets = turned.copy(), np.zeros_like(anchors)
@@ -111,12 +111,6 @@ def smpl_motion(character: Character, clip: Clip) -> SkeletonMotion:
 def _check_columns(character: Character, clip: Clip) -> None:
     if clip.qpos.shape[1] != character.nq:
         raise ValueError(f"clip {clip.name!r} has {clip.qpos.shape[1]} columns; {character.name!r} has {character.nq}")
-
-
-def _anchor(character: Character, body: int) -> np.ndarray:
-    """Where the body's first joint is, in the body's frame; its origin where it has none."""
-    first = character.model.body_jntadr[body]
-    return character.model.jnt_pos[first] if first >= 0 else np.zeros(3)
 
 
 def _posed(figure: Figure, clip: Clip) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

@@ -62,6 +62,14 @@ def kinematics(body: Character, qpos: np.ndarray, fps: float) -> Motion:
     )
 
 
+def joint_anchors(body: Character) -> np.ndarray:
+    """Where each body's first joint is (B, 3), in the body's frame; its origin where it has none."""
+    model, anchors = body.model, np.zeros((body.model.nbody - 1, 3))
+    first = model.body_jntadr[1:]
+    anchors[first >= 0] = model.jnt_pos[first[first >= 0]]
+    return anchors
+
+
 def lowest_point(body: Character, qpos: np.ndarray) -> np.ndarray:
     """Height (T,) of the lowest point of any geom for poses (T, nq), metres."""
     model, batch = body.model, Batch(body.model, len(qpos))

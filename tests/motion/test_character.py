@@ -1,6 +1,7 @@
 """character.py: the built-in humanoid against its source, PD targets against MuJoCo, messages."""
 
 import json
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -10,6 +11,7 @@ import pytest
 from kinetok.config import ConfigError
 from kinetok.motion import character
 from kinetok.motion.character import Character, characters, from_mjcf, read_mjcf
+from kinetok.motion.formats import read_clips
 
 # joint id of the source file -> our body; its hands are bodies without a joint of their own
 BODIES = (
@@ -202,6 +204,22 @@ def test_load_from_a_path_with_roles_beside_it(tmp_path):
     path.with_suffix(".json").write_text('{"hands": ["b"]}')
     robot = Character.load(str(path))
     assert (robot.name, robot.kp.tolist(), robot.bodies("hands")) == ("robot", [7.0], [1])
+
+
+def test_a_g1_of_another_source_has_the_roles_of_the_built_in_one(data_dir, tmp_path, monkeypatch):
+    pytest.importorskip("mujoco_menagerie")
+    folder = tmp_path / "unitree_g1"
+    shutil.copytree(data_dir / "g1" / "assets", folder / "assets")
+    shutil.copyfile(data_dir / "g1" / "g1_capsules_pd.xml", folder / "g1.xml")  # with meshes, as the menagerie's is
+    monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
+    Character.load.cache_clear()
+    robot, known = Character.load("menagerie:unitree_g1"), Character.load("g1")
+    assert robot.model.nmesh > 30 and robot.body_names == known.body_names and robot.roles == known.roles
+    (clip,) = read_clips(data_dir / "bvh" / "cmu_motionbuilder" / "cmu_12_01_walk.bvh", "menagerie:unitree_g1")
+    assert clip.character == "menagerie:unitree_g1" and robot.span(clip.qpos[40])[0] == pytest.approx(0, abs=0.03)
+    (folder / "g1.json").write_text("{}")  # roles beside the file win
+    Character.load.cache_clear()
+    assert Character.load("menagerie:unitree_g1").roles == {}
 
 
 def test_load_messages(tmp_path):

@@ -13,10 +13,12 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.motion.check import mend
 from kinetok.motion.clip import Clip
+from kinetok.motion.export import skeleton_motion
 from kinetok.motion.formats import read
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.retarget import retarget
 from kinetok.motion.retarget.body import measure
+from kinetok.motion.retarget.direct import copy_joints
 from kinetok.motion.retarget.report import beyond_limits
 from kinetok.motion.retarget.targets import bend, envelope
 from kinetok.motion.rigs import REQUIRED, RigError, find_rig
@@ -86,23 +88,53 @@ def apart(qpos: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def test_its_own_motion_comes_back():
     clip = made()
-    result = retarget(skeleton(clip), "humanoid")
+    result = retarget(skeleton(clip), "humanoid", direct=False)
     assert apart(result.clip.qpos, clip.qpos).max() < 1e-3
     report = result.report
     assert report.residual_max < 1e-3 and report.skate < 1e-3 and report.penetration_max < 1e-6
     assert report.contact == 1 and report.violations == 0 and report.scale == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.parametrize("zero", ["its body frames unturned", "its reference pose"])
+def test_angles_of_its_own_skeleton_are_copied(zero):
+    clip = made(lift=0.4)
+    body = Character.load("humanoid")
+    motion = skeleton(clip) if zero.startswith("its body") else skeleton_motion(body, clip)
+    large = replace(motion, offsets=2 * motion.offsets, root=2 * motion.root)
+    result = retarget(large, "humanoid")
+    assert result.report.rig.endswith("joint by joint") and result.report.scale == pytest.approx(0.5)
+    assert np.abs(result.clip.qpos[:, 7:] - clip.qpos[:, 7:]).max() < 1e-6
+    assert np.abs(result.clip.qpos[:, :7] - clip.qpos[:, :7]).max() < 0.02  # it is put on the floor, which takes a cm
+    assert result.report.residual_max < 1e-6 and result.report.violations == 0
+
+
+def test_angles_are_not_copied_where_skeletons_differ():
+    motion, knee = skeleton(made()), 10
+    assert motion.joints[knee] == "right_shin"
+    longer = replace(motion, offsets=motion.offsets * np.where(np.arange(15) == knee, 1.1, 1)[:, None])
+    local = motion.local.copy()
+    local[:, knee] = rotation.multiply(local[:, knee], rotation.from_rotvec(np.tile([0.0, 0, 0.2], (len(local), 1))))
+    aside = replace(motion, local=local)  # a knee that is twisted as well as bent
+    elsewhere = replace(
+        motion, parents=(*motion.parents[:12], 9, *motion.parents[13:])
+    )  # a leg that hangs on the other
+    rig, figure = find_rig(motion), measure(Character.load("humanoid"))
+    assert copy_joints(motion, rig, figure)
+    for other in (longer, aside, elsewhere):
+        assert copy_joints(other, rig, figure) is None
+    assert retarget(longer, "humanoid").report.rig == "family amp"
+
+
 def test_feet_that_leave_the_ground_are_let_go():
     clip = made(lift=0.4)
-    result = retarget(skeleton(clip), "humanoid")
+    result = retarget(skeleton(clip), "humanoid", direct=False)
     gap = apart(result.clip.qpos, clip.qpos)
     assert gap.max() < 0.04 and np.median(gap) < 0.005  # take-off and landing are partly taken for standing
     assert 0.1 < result.report.contact < 0.4
 
 
 def test_a_recorded_walk_comes_back(walk):
-    result = retarget(skeleton(walk), "humanoid", fps=None)
+    result = retarget(skeleton(walk), "humanoid", fps=None, direct=False)
     assert np.median(apart(result.clip.qpos, walk.qpos)) < 0.012  # feet are pinned and levelled, the rest follows
     assert result.report.residual_mean < 0.01
 
@@ -112,7 +144,7 @@ def test_another_zero_pose_of_the_arms_changes_nothing():
     turns = np.tile([1.0, 0, 0, 0], (len(motion.joints), 1))
     for name in ("left_upper_arm", "right_upper_arm", "left_lower_arm", "left_hand"):
         turns[motion.joints.index(name)] = rotation.from_rotvec(np.array([0.9, -0.4, 0.7]))
-    one, other = retarget(motion, "humanoid"), retarget(reframed(motion, turns), "humanoid")
+    one, other = retarget(motion, "humanoid", direct=False), retarget(reframed(motion, turns), "humanoid")
     assert one.report.calibration == other.report.calibration == "rest"
     assert apart(one.clip.qpos, other.clip.qpos).max() < 1e-4
 
@@ -129,7 +161,7 @@ def test_a_zero_pose_without_sense_is_calibrated_by_the_motion():
 def test_scale_and_rate():
     motion = skeleton(made())
     large = replace(motion, offsets=2 * motion.offsets, root=2 * motion.root, fps=60.0)
-    result = retarget(large, "humanoid", fps=20.0)
+    result = retarget(large, "humanoid", fps=20.0, direct=False)
     assert result.report.scale == pytest.approx(0.5, abs=1e-6)
     assert result.clip.fps == 20.0 and len(result.clip.qpos) == int(large.seconds * 20 + 1e-6) + 1
     assert retarget(large, "humanoid", fps=None).clip.fps == 60.0
@@ -147,7 +179,7 @@ def test_a_robot_stands_within_its_limits():
 
 
 def test_the_report_is_json():
-    report = retarget(skeleton(made(12)), "humanoid").report
+    report = retarget(skeleton(made(12)), "humanoid", direct=False).report
     assert json.loads(json.dumps(report.to_json()))["frames"] == 12
 
 
@@ -237,7 +269,7 @@ def test_given_parts_win():
     motion = replace(motion, joints=joints)
     rig = find_rig(motion, {"left_thigh": "Oberschenkel"})
     assert rig.how == "given" and joints[rig.parts["left_thigh"]] == "Oberschenkel"
-    assert retarget(motion, "humanoid", parts={"left_thigh": "Oberschenkel"}).report.rig == "given"
+    assert retarget(motion, "humanoid", parts={"left_thigh": "Oberschenkel"}).report.rig == "given, joint by joint"
 
 
 @pytest.mark.parametrize(
@@ -267,8 +299,9 @@ def test_what_else_is_refused(tiny, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="fewer than two frames at 1 fps"):
         retarget(motion, "humanoid", fps=1)
     monkeypatch.setitem(sys.modules, "mink", None)
+    assert retarget(motion, "humanoid").clip.fps == FPS  # its own skeleton needs no solver
     with pytest.raises(ImportError, match=r"pip install 'kinetok\[retarget\]'"):
-        retarget(motion, "humanoid")
+        retarget(motion, "humanoid", direct=False)
 
 
 # -- real files
@@ -292,7 +325,7 @@ def test_recorded_files(data_dir, file):
     motion, _ = mend(recorded)
     assert isinstance(motion, SkeletonMotion)
     short = replace(motion, root=motion.root[: int(1.5 * motion.fps)], local=motion.local[: int(1.5 * motion.fps)])
-    result = retarget(short, "humanoid")
+    result = retarget(short, "humanoid", direct=False)
     report = result.report
     assert find_rig(short).how == f"family {RECORDED[file]}" and report.calibration == "rest"
     assert report.residual_mean < 0.012 and report.residual_max < 0.12
@@ -324,7 +357,7 @@ def test_a_foot_that_stands_is_level_on_whatever_floor_was_recorded(data_dir, fi
     motion, _ = mend(recorded)
     assert isinstance(motion, SkeletonMotion)
     body = Character.load("humanoid")
-    clip = retarget(motion, "humanoid").clip
+    clip = retarget(motion, "humanoid", direct=False).clip
     moved = kinematics(body, clip.qpos, clip.fps)
     for foot in body.bodies("feet"):
         ahead = rotation.rotate(moved.xquat[:, foot], np.array([1.0, 0.0, 0.0]))

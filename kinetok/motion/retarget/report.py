@@ -1,6 +1,6 @@
 """How well a retargeted motion follows its plan, touches the ground and keeps to the joints' limits.
 
-report = assess(clip, motion, rig, actor, figure, plan)
+report = assess(clip, motion, rig, actor, figure, scaled=plan.scaled, scale=plan.scale)
 json.dumps(report.to_json())
 """
 
@@ -14,7 +14,6 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import kinematics, lowest_point
 from kinetok.motion.retarget.body import Figure
 from kinetok.motion.retarget.source import LIMBS, SIDES, Actor
-from kinetok.motion.retarget.targets import Plan
 from kinetok.motion.rigs import Rig
 from kinetok.motion.skeleton import SkeletonMotion
 
@@ -54,8 +53,17 @@ class RetargetReport:
         return asdict(self)
 
 
-def assess(clip: Clip, motion: SkeletonMotion, rig: Rig, actor: Actor, figure: Figure, plan: Plan) -> RetargetReport:
-    """Measure a clip of the figure's character that was made by a plan."""
+def assess(
+    clip: Clip,
+    motion: SkeletonMotion,
+    rig: Rig,
+    actor: Actor,
+    figure: Figure,
+    *,
+    scaled: dict[str, np.ndarray],
+    scale: float,
+) -> RetargetReport:
+    """Measure a clip of the figure's character. scaled: part -> (T, 3) m, where its joint centres should be."""
     body = figure.character
     moved = kinematics(body, clip.qpos, clip.fps)
     under = np.maximum(-lowest_point(body, clip.qpos), 0)
@@ -65,7 +73,7 @@ def assess(clip: Clip, motion: SkeletonMotion, rig: Rig, actor: Actor, figure: F
         at = figure.bodies[part]
         centre = np.broadcast_to(figure.centre[part], (len(clip.qpos), 3))
         where = moved.xpos[:, at] + rotation.rotate(moved.xquat[:, at], centre)
-        residuals.append(np.linalg.norm(where - plan.scaled[part], axis=-1))
+        residuals.append(np.linalg.norm(where - scaled[part], axis=-1))
     return RetargetReport(
         name=clip.name,
         family=motion.family,
@@ -74,7 +82,7 @@ def assess(clip: Clip, motion: SkeletonMotion, rig: Rig, actor: Actor, figure: F
         calibration=actor.calibration,
         frames=len(clip.qpos),
         fps=clip.fps,
-        scale=plan.scale,
+        scale=scale,
         residual_mean=float(np.mean(residuals)),
         residual_max=float(np.max(residuals)),
         contact=float(np.mean(actor.contact["left"] | actor.contact["right"])),

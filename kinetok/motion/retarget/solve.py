@@ -179,12 +179,21 @@ def closed_form(figure: Figure, plan: Plan) -> tuple[np.ndarray, np.ndarray, dic
             turn = _shorten(turn, high) if limited else turn
             poses[:, at : at + 4], known[at : at + 4] = turn, True
         else:
-            angle = 2 * np.arctan2(turn[:, 1:] @ axis, turn[:, 0]) + model.qpos0[at]
-            angle = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+            angle = wrapped(hinge_angle(turn, axis) + model.qpos0[at])
             poses[:, at], known[at] = np.clip(angle, low, high) if limited else angle, True
             turn = rotation.from_rotvec((poses[:, at] - model.qpos0[at])[:, None] * axis)
         turns[part] = rotation.multiply(rotation.multiply(base, turn), np.broadcast_to(d, turn.shape))
     return poses, known, turns
+
+
+def hinge_angle(turn: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Angles (T,) about an axis (3,) that are nearest to rotations (T, 4)."""
+    return 2 * np.arctan2(turn[:, 1:] @ axis, turn[:, 0])
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """The same angles between -pi and pi."""
+    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def limb_columns(figure: Figure) -> dict[str, np.ndarray]:
