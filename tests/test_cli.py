@@ -164,11 +164,27 @@ def test_a_library_grows_and_is_parted(clip, tmp_path):
     assert wrong.exit_code == 1 and "between 0 and 1" in wrong.output and not (tmp_path / "none").exists()
 
 
+def test_hours_of_a_library_are_drawn(clip, tmp_path):
+    out, json_of = tmp_path / "all.safetensors", tmp_path / "few.json"
+    others = [write_clip(tmp_path / "more" / f"c{number}.txt", frames(11)) for number in range(9)]
+    assert kinetok("clips", "import", clip, *others, "--out", out).exit_code == 0
+    words = ("evaluate", "tracking", "--clips", out, "--episodes", 1, "--json", json_of)
+    assert kinetok(*words, "--hours", 1 / 3600, "--seed", 3).exit_code == 0
+    few = json.loads(json_of.read_text())["clips"]
+    assert 1 < len(few) < 10
+    one = kinetok(
+        "tokenize", "encode", out, "--tokenizer", "humanoid-fsq", "--name", "c4", "--out", tmp_path / "t.safetensors"
+    )
+    assert one.exit_code == 0, one.output
+    several = kinetok("tokenize", "encode", out, "--tokenizer", "humanoid-fsq", "--out", tmp_path / "u.safetensors")
+    assert several.exit_code == 1 and "holds 10 clips; choose one with --name" in several.output
+
+
 def test_a_library_is_of_one_body(clip, data_dir, tmp_path):
     robot, out = data_dir / "g1" / "kimodo_wxyz" / "kimodo_walk.csv", tmp_path / "both.safetensors"
     result = kinetok("clips", "import", clip, robot, "--out", out)
     assert result.exit_code == 1 and not out.exists()
-    assert "kimodo_walk is of 'g1'; wave is of 'humanoid': a library holds motion of one body" in result.output
+    assert "wave is of 'humanoid'; kimodo_walk is of 'g1': a library holds motion of one body" in result.output
     asked = kinetok("clips", "import", robot, "--dialect", "kimodo", "--fps", 60, "--out", out)
     assert asked.exit_code == 0 and "kimodo as asked, 60 fps as asked" in read_clips(out)[0].source
     assert "0.0 is not in the range" in kinetok("clips", "import", robot, "--fps", 0, "--out", out).output

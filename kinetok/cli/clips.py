@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, load_clips, one_clip, option_seed, write_motion
+from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, each_clip, one_clip, option_seed, write_motion
 
 option_fps = click.option(
     "--fps",
@@ -31,7 +31,7 @@ def clips_info(paths: tuple[Path, ...]) -> None:
     from kinetok.motion.kinematics import lowest_point
 
     click.echo(f"{'name':<22}{'frames':>7}{'fps':>8}{'seconds':>9}{'loop':>6}{'lowest m':>10}{'path m':>8}  source")
-    for clip in load_clips(paths):
+    for clip in each_clip(paths):
         low = lowest_point(Character.load(clip.character), clip.qpos).min()
         steps = ((clip.qpos[1:, :2] - clip.qpos[:-1, :2]) ** 2).sum(1) ** 0.5
         click.echo(
@@ -152,16 +152,23 @@ def clips_import(
 
     if out.suffix or not append:
         check_suffix(out, ".safetensors")
-    found = load_clips(paths, character, fps, dialect)
-    bodies = sorted({clip.character for clip in found})
-    if len(bodies) > 1:
-        some = "; ".join(f"{next(c.name for c in found if c.character == body)} is of {body!r}" for body in bodies)
-        raise ValueError(f"{some}: a library holds motion of one body. Import each into a library of its own")
+    read = []  # (name, seconds, body)
+
+    def found():
+        for clip in each_clip(paths, character, fps, dialect):
+            read.append((clip.name, clip.seconds, clip.character))
+            if clip.character != read[0][2]:
+                raise ValueError(
+                    f"{read[0][0]} is of {read[0][2]!r}; {clip.name} is of {clip.character!r}: a library holds motion "
+                    "of one body. Import each into a library of its own, or retarget all to one by --character"
+                )
+            yield clip
+
     if append:
-        ClipLibrary.append(out, found, dtype="float16" if half else None)
+        ClipLibrary.append(out, found(), dtype="float16" if half else None)
     else:
-        ClipLibrary.write(out, found, dtype="float16" if half else "float32")
-    told = f"{len(found)} clips, {sum(c.seconds for c in found):.1f} s"
+        ClipLibrary.write(out, found(), dtype="float16" if half else "float32")
+    told = f"{len(read)} clips, {sum(seconds for _, seconds, _ in read):.1f} s"
     click.echo(f"added to {out}: {told}" if append else f"wrote {out}: {told}")
 
 

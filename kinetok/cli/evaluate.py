@@ -8,6 +8,7 @@ from kinetok.cli.shared import (
     Chain,
     load_clips,
     option_device,
+    option_hours,
     option_seed,
     option_threads,
     show_json,
@@ -22,6 +23,7 @@ def evaluate() -> None:
 @evaluate.command("tracking")
 @click.option("--tokenizer", default="humanoid-fsq", show_default=True, type=PATHS, help="Directory or packaged name.")
 @click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@option_hours
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
 @click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
@@ -35,7 +37,7 @@ def evaluate() -> None:
 @option_threads
 @option_device
 @option_seed
-def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads, seed) -> None:
+def evaluate_tracking(tokenizer, paths, hours, out, episodes, push, from_start, threads, seed) -> None:
     """Success rate and MPJPE of a tokenizer (or a teacher) on clips, by clip and overall."""
     from kinetok.evaluate import evaluate_tracking as score
     from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -43,7 +45,7 @@ def evaluate_tracking(tokenizer, paths, out, episodes, push, from_start, threads
     model = MotionTokenizer.from_pretrained(tokenizer)
     found = score(
         model,
-        load_clips(paths),
+        load_clips(paths, hours, seed),
         episodes=episodes,
         push=push,
         from_start=from_start,

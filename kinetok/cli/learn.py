@@ -2,15 +2,16 @@
 
 import click
 
-from kinetok.cli.shared import PATHS, TASK_NAMES, configured, load_clips
+from kinetok.cli.shared import PATHS, TASK_NAMES, configured, load_clips, option_hours
 
 
 @click.command()
 @click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
 @click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@option_hours
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")
-def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
+def pretrain(tokenizer, paths, hours, out, preset, settings, threads, seed) -> None:
     """Train the prior: a GPT over the tokens of the frozen tracker's own roll-outs.
 
     \b
@@ -24,7 +25,7 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
     config = override(pick(presets.PRETRAIN, preset, "preset")(), settings)
     train(
         MotionTokenizer.from_pretrained(tokenizer),
-        load_clips(paths),
+        load_clips(paths, hours, seed),
         config,
         out,
         tokenizer_path=tokenizer,
@@ -44,9 +45,10 @@ def pretrain(tokenizer, paths, out, preset, settings, threads, seed) -> None:
     "--clips", "paths", multiple=True, type=PATHS, help="Motions for sft and hindsight: file, library or folder."
 )
 @click.option("--from", "start", default=None, type=PATHS, help="A fine-tuned skill whose adapter rl begins with.")
+@option_hours
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")
-def finetune(prior, task, adapter, method, paths, start, out, preset, settings, threads, seed) -> None:
+def finetune(prior, task, adapter, method, paths, hours, start, out, preset, settings, threads, seed) -> None:
     """Bend the frozen prior to a task with a small adapter: by examples (sft), by demonstrations of the task that are
     made of --clips (hindsight), by reward (rl), or one after the other.
 
@@ -75,4 +77,4 @@ def finetune(prior, task, adapter, method, paths, start, out, preset, settings, 
         config = replace(config, task=skill.task, adapter=skill.adapted.config)
     config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
     config = override(replace(config, methods=tuple(method.split(","))), settings)
-    bend(model, config, out, base=base, clips=load_clips(paths), start=start, seed=seed, threads=threads)
+    bend(model, config, out, base=base, clips=load_clips(paths, hours, seed), start=start, seed=seed, threads=threads)

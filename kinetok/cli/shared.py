@@ -89,16 +89,34 @@ def configured(presets: str):
     return decorate
 
 
-def load_clips(
+option_hours = click.option(
+    "--hours",
+    type=click.FloatRange(min=0, min_open=True),
+    default=None,
+    help="Draw so many hours of the clips by --seed; their libraries may be larger than memory.  [default: all]",
+)
+
+
+def say(line: str) -> None:
+    """Tell the user what was repaired or assumed."""
+    click.echo(line, err=True)
+
+
+def each_clip(
     paths: tuple[Path, ...], character: str | None = None, fps: float | None = None, dialect: str | None = None
 ):
-    """The clips of all paths; what was repaired or assumed is said on stderr."""
-    from kinetok.motion.formats import read_clips
+    """The clips of all paths one after the other; what was repaired or assumed is said on stderr."""
+    from kinetok.motion import formats
 
-    def say(line: str) -> None:
-        click.echo(line, err=True)
+    for path in paths:
+        yield from formats.each_clip(path, character, fps=fps, dialect=dialect, say=say)
 
-    return [clip for path in paths for clip in read_clips(path, character, fps=fps, dialect=dialect, say=say)]
+
+def load_clips(paths: tuple[Path, ...], hours: float | None = None, seed: int = 0):
+    """All clips of the paths, or so many hours of them."""
+    from kinetok.motion.formats import draw_clips
+
+    return list(each_clip(paths)) if hours is None else draw_clips(paths, hours, seed, say=say)
 
 
 def check_suffix(out: Path, *allowed: str) -> None:
@@ -127,14 +145,17 @@ TASK_NAMES = "target|steering|path"
 def one_clip(source: Path, name: str | None):
     """The clip of that name in a file or library, or its only one."""
     from kinetok.config import nearest
+    from kinetok.motion.formats import open_library
 
-    found = load_clips((source,))
-    names = [clip.name for clip in found]
-    if name is None and len(found) > 1:
-        raise ValueError(f"{source} holds {len(found)} clips; choose one with --name: {', '.join(names[:12])}")
+    library = open_library(source)
+    found = [] if library is not None else load_clips((source,))
+    names = library.names if library is not None else tuple(clip.name for clip in found)
+    if name is None and len(names) > 1:
+        raise ValueError(f"{source} holds {len(names)} clips; choose one with --name: {', '.join(names[:12])}")
     if name is not None and name not in names:
         raise ValueError(f"{source} holds no clip {name!r}{nearest(name, names)}")
-    return found[names.index(name) if name else 0]
+    index = names.index(name) if name else 0
+    return library.clip(index) if library is not None else found[index]
 
 
 def write_motion(out: Path, *clips, caption: str = "") -> None:

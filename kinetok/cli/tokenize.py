@@ -2,7 +2,17 @@
 
 import click
 
-from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, configured, load_clips, write_motion
+from kinetok.cli.shared import (
+    EXPORTS,
+    PATHS,
+    Chain,
+    check_suffix,
+    configured,
+    load_clips,
+    one_clip,
+    option_hours,
+    write_motion,
+)
 
 
 @click.group(cls=Chain)
@@ -12,10 +22,11 @@ def tokenize() -> None:
 
 @tokenize.command("fit")
 @click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
+@option_hours
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @click.option("--stages", default=None, help="Of teacher,distill,ppo; ppo alone is the paper's end-to-end form.")
 @configured("one-clip")
-def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
+def tokenize_fit(paths, hours, out, stages, preset, settings, threads, seed) -> None:
     """Train a tokenizer: encoder, FSQ bottleneck and decoder, through the simulated tracking loop.
 
     \b
@@ -33,24 +44,22 @@ def tokenize_fit(paths, out, stages, preset, settings, threads, seed) -> None:
     if stages:
         settings = (*settings, f"stages={stages}")
     config = override(pick(presets.FIT, preset, "preset")(), settings)
-    fit(load_clips(paths), config, out, seed=seed, threads=threads)
+    fit(load_clips(paths, hours, seed), config, out, seed=seed, threads=threads)
 
 
 @tokenize.command("encode")
 @click.argument("clip", type=PATHS)
 @click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
 @click.option("--out", required=True, type=PATHS, help="Token file to write, ending in .safetensors.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
 @click.option("--seconds", type=float, default=None, help="How long to track; default once through the clip.")
-def tokenize_encode(clip, tokenizer, out, seconds) -> None:
+def tokenize_encode(clip, tokenizer, out, name, seconds) -> None:
     """Write the tokens of a clip: (T, S) int64, one row per control step, with their layout."""
     from kinetok.tokenizers.codec import encode_clip
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
     check_suffix(out, ".safetensors")
-    found = load_clips((clip,))
-    if len(found) > 1:
-        raise ValueError(f"{clip} holds {len(found)} clips; encode one at a time")
-    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), found[0], seconds=seconds)
+    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), one_clip(clip, name), seconds=seconds)
     stream.save(out)
     click.echo(f"wrote {out}: tokens {tuple(stream.tokens.shape)}, {stream.layout}")
 

@@ -19,7 +19,7 @@ import hashlib
 import itertools
 import os
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -65,6 +65,7 @@ class ClipLibrary:
     @staticmethod
     def write(path: Path, clips: Iterable[Clip], *, dtype: Dtype = "float32") -> None:
         """Write the clips as one file, one after the other; the file appears whole or not at all."""
+        clips = _begun(clips)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = _temporary(path)
         try:
@@ -81,6 +82,7 @@ class ClipLibrary:
         written anew with the clips behind and then replaced: time and disk in proportion to it, one writer at a time.
         Both happen whole or not at all.
         """
+        clips = _begun(clips)
         old = ClipLibrary.open(path) if path.exists() and (path.is_file() or _part_paths(path)) else None
         wanted: Dtype = dtype or (_dtype(old.parts[-1]) if old else "float32")
         if path.suffix == ".safetensors":
@@ -321,6 +323,12 @@ def _windows(part: Part, body: Character, ids: np.ndarray, times: np.ndarray) ->
 
 def _share(seed: int, source: str) -> float:
     return int.from_bytes(hashlib.sha256(f"{seed}:{source}".encode()).digest()[:8], "big") / 2**64
+
+
+def _begun(clips: Iterable[Clip]) -> Iterator[Clip]:
+    """The clips with the first one read already: if that fails, no folder has been made."""
+    clips = iter(clips)
+    return itertools.chain(list(itertools.islice(clips, 1)), clips)
 
 
 def _temporary(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
     motions = read(Path("walk.bvh"))                  # [SkeletonMotion], as recorded, or [Clip] of its own character
     clips = read_clips(Path("recordings"), "g1")      # every file of a folder, skeletons retargeted to the character
+    for clip in each_clip(Path("large"), "g1"): ...   # the same one after the other, none of them kept
 
 A format is told by its suffix, and by content where a suffix is not its own. In a folder and the folders in it, files
 of no known format are passed over; a file that is named must be readable. Clips keep the character they were recorded
@@ -9,9 +10,12 @@ for: DeepMimic's humanoid, Unitree's G1.
 """
 
 import fnmatch
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from kinetok.motion.character import Character
 from kinetok.motion.check import FLOOR_WRONG, mend, report
@@ -39,10 +43,10 @@ def by_suffix(path: Path) -> bool:
     return path.is_file()
 
 
-def read_library(path: Path) -> list[Clip]:
-    """All clips of a kinetok library."""
+def read_library(path: Path) -> Iterator[Clip]:
+    """The clips of a kinetok library, one after the other."""
     library = ClipLibrary.open(path)
-    return [library.clip(index) for index in range(len(library))]
+    return (library.clip(index) for index in range(len(library)))
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[Path], bool]
-    read: Callable[..., Clip | SkeletonMotion | list[Clip]]
+    read: Callable[..., Clip | SkeletonMotion | Iterable[Clip]]
     untold: tuple[str, ...] = ()
 
 
@@ -101,7 +105,19 @@ def read_clips(
     dialect: str | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> list[Clip]:
-    """The motions of a path as clips that passed the gate (motion.check).
+    """The motions of a path as clips; see `each_clip`."""
+    return list(each_clip(path, character, fps=fps, dialect=dialect, say=say))
+
+
+def each_clip(
+    path: Path,
+    character: str | None = None,
+    *,
+    fps: float | None = None,
+    dialect: str | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Iterator[Clip]:
+    """The motions of a path as clips that passed the gate (motion.check), one after the other.
 
     What has one right repair is repaired. A wrong unit, a wrong axis, feet deep under the floor and a root that leaps
     are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Recorded skeletons are then
@@ -109,13 +125,35 @@ def read_clips(
     of all this, a line each: what was repaired, what stays in, how well a motion was retargeted. The clips of a library
     have been through the gate when it was written.
     """
-    found = []
     for file, known in files_of(path):
-        for motion in read_file(file, known, fps=fps, dialect=dialect):
+        for motion in each_motion(file, known, fps=fps, dialect=dialect):
             if known.name != OWN:
                 motion = _gated(file, motion, say)
-            found.append(_fit(file, motion, character, say))
-    return found
+            yield _fit(file, motion, character, say)
+
+
+def open_library(path: Path) -> ClipLibrary | None:
+    """The kinetok library at a path, a file or a folder of nothing else, unread; None where something else is there."""
+    if path.is_dir():
+        own = all(known.name == OWN for _, known in files_of(path)) and any(path.glob("*.safetensors"))
+    else:
+        own = path.suffix == ".safetensors" and path.is_file()
+    return ClipLibrary.open(path) if own else None
+
+
+def draw_clips(paths: Sequence[Path], hours: float, seed: int, **settings: Any) -> list[Clip]:
+    """Clips drawn from everything at the paths until there are so many hours of them; settings: of `each_clip`.
+
+    Of kinetok libraries nothing else is read, so they may be larger than memory.
+    """
+    pools = [open_library(path) or ClipLibrary.of(read_clips(path, **settings)) for path in paths]
+    seconds = np.concatenate([pool.seconds for pool in pools])
+    order = np.random.default_rng(seed).permutation(len(seconds))
+    enough = int(np.searchsorted(np.cumsum(seconds[order]), 3600 * hours)) + 1
+    firsts = np.cumsum([0, *(len(pool) for pool in pools)])
+    drawn = np.sort(order[:enough])
+    owners = np.searchsorted(firsts, drawn, side="right") - 1
+    return [pools[owner].clip(int(index - firsts[owner])) for owner, index in zip(owners, drawn, strict=True)]
 
 
 def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]) -> Clip | SkeletonMotion:
@@ -186,14 +224,20 @@ def read_file(
     path: Path, known: Format, *, fps: float | None = None, dialect: str | None = None
 ) -> list[Clip | SkeletonMotion]:
     """The motions of one file of a known format; see `read`."""
+    return list(each_motion(path, known, fps=fps, dialect=dialect))
+
+
+def each_motion(
+    path: Path, known: Format, *, fps: float | None = None, dialect: str | None = None
+) -> Iterator[Clip | SkeletonMotion]:
+    """The motions of one file of a known format, one after the other."""
     told = {name: value for name, value in (("fps", fps), ("dialect", dialect)) if name in known.untold}
     motion = known.read(path, **told)
-    motions: list[Clip | SkeletonMotion] = [*motion] if isinstance(motion, list) else [motion]
-    for found in motions:
+    for found in (motion,) if isinstance(motion, Clip | SkeletonMotion) else motion:
         if not RATES[0] <= found.fps <= RATES[1]:
             reason = f"{found.fps:.4g} frames per second; a motion has {RATES[0]:g} to {RATES[1]:g}"
             raise FormatError(path, found.name, reason)
-    return motions
+        yield found
 
 
 def _format(path: Path) -> Format | None:

@@ -9,6 +9,7 @@ parts a policy reads is the policy's choice: a tokenizer's encoder reads the win
 teacher may read all. Clips are tabulated once at the control rate, loops unrolled to the longest episode.
 """
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,12 +17,15 @@ import numpy as np
 from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
+from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import kinematics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim import observe
 from kinetok.sim.batch import BodyState
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
+
+LARGEST = 0.8  # of the machine's memory that a table may take
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,38 +61,64 @@ class TrackingConfig:
 
 
 class ReferenceTable:
-    """Clips as arrays over frames at the control rate (float32); frames of clip k are first[k] .. last[k]."""
+    """Clips as arrays over frames at the control rate; frames of clip k are first[k] .. last[k].
+
+    It holds every frame in memory, some 2 kB each for the humanoid, a quarter of a gigabyte an hour; more than the
+    machine has is refused before it is filled.
+    """
 
     def __init__(self, library: ClipLibrary, *, control_hz: int = 30, seconds: float = 20.0):
         self.character = Character.load(library.character)
         self.names, self.control_hz = library.names, control_hz
-        motions, counts, self.cycle = [], [], np.empty(len(library), dtype=int)
-        for index in range(len(library)):
-            clip = library.clip(index)
-            self.cycle[index] = max(int(clip.seconds * control_hz + 1e-6), 1)
-            span = self.cycle[index] + (round(seconds * control_hz) if clip.loop else 0)
-            times = np.arange(span + 1) / control_hz
-            motions.append(kinematics(self.character, clip.at(times), control_hz))
-            counts.append(span + 1)
+        self.cycle = np.maximum((library.seconds * control_hz + 1e-6).astype(int), 1)
+        counts = self.cycle + round(seconds * control_hz) * library.loop + 1
         self.first = np.cumsum(counts) - counts
         self.last = self.first + counts - 1
-        self.qpos = np.concatenate([m.qpos for m in motions])
-        self.qvel = np.concatenate([m.qvel for m in motions])
-        quat = np.concatenate([m.xquat for m in motions])
-        self.body = BodyState(
-            pos=np.concatenate([m.xpos for m in motions]).astype(np.float32),
-            mat=rotation.to_matrix(quat).astype(np.float32),
-            linear=np.concatenate([m.linear for m in motions]).astype(np.float32),
-            angular=np.concatenate([m.angular for m in motions]).astype(np.float32),
-            quat=quat[:, 0].astype(np.float32),
-        )
-        self.heading = rotation.heading(self.body.quat)
-        self.pose = observe.pose_features(self.body.pos, self.body.mat, self.body.quat)
+        columns: dict[str, np.ndarray] = {}
+        for index, (first, count) in enumerate(zip(self.first, counts, strict=True)):
+            some = _tabulated(self.character, library.clip(index), int(count), control_hz)
+            if not columns:
+                _refuse_too_large(counts.sum(), sum(part[0].nbytes for part in some.values()), control_hz)
+                columns = {name: np.empty((counts.sum(), *part.shape[1:]), part.dtype) for name, part in some.items()}
+            for name, part in some.items():
+                columns[name][first : first + count] = part
+        body = ("pos", "mat", "linear", "angular", "quat")
+        self.body = BodyState(**{name: columns[name] for name in body})
+        self.qpos, self.qvel, self.heading = columns["qpos"], columns["qvel"], columns["heading"]
+        self.pose, self.target = columns["pose"], columns["target"]
         self.root = np.ascontiguousarray(self.body.pos[:, 0])
-        body = self.character
-        # PD target that makes a joint with damping kd follow a moving reference: q + kd / kp * qd
-        ctrl = body.pose_to_ctrl(self.qpos) + body.kd / body.kp * self.qvel[:, body.dof]
-        self.target = ctrl.astype(np.float32)
+
+
+def _tabulated(body: Character, clip: Clip, frames: int, control_hz: int) -> dict[str, np.ndarray]:
+    """What a table holds of the first frames of a clip, by column."""
+    motion = kinematics(body, clip.at(np.arange(frames) / control_hz), control_hz)
+    pos, mat = motion.xpos.astype(np.float32), rotation.to_matrix(motion.xquat).astype(np.float32)
+    quat = motion.xquat[:, 0].astype(np.float32)
+    # PD target that makes a joint with damping kd follow a moving reference: q + kd / kp * qd
+    target = body.pose_to_ctrl(motion.qpos) + body.kd / body.kp * motion.qvel[:, body.dof]
+    return {
+        "qpos": motion.qpos,
+        "qvel": motion.qvel,
+        "pos": pos,
+        "mat": mat,
+        "linear": motion.linear.astype(np.float32),
+        "angular": motion.angular.astype(np.float32),
+        "quat": quat,
+        "heading": rotation.heading(quat),
+        "pose": observe.pose_features(pos, mat, quat),
+        "target": target.astype(np.float32),
+    }
+
+
+def _refuse_too_large(frames: int, size: int, control_hz: int) -> None:
+    """Refuse a table of so many frames of so many bytes that the machine's memory cannot hold."""
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if frames * size > LARGEST * there:
+        raise ConfigError(
+            f"{frames / control_hz / 3600:.1f} hours of reference frames take {frames * size / 1e9:.1f} GB, and this "
+            f"machine has {there / 1e9:.1f} GB of memory: draw some of the clips at random, --hours "
+            f"{max(1, int(0.25 * there / size / control_hz / 3600))}"
+        )
 
 
 class Tracking:

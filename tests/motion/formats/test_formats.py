@@ -8,8 +8,20 @@ import numpy as np
 import pytest
 
 from kinetok.motion.clip import Clip
-from kinetok.motion.formats import FORMATS, FormatError, SkeletonMotion, read, read_clips, write_amass, write_robot_csv
+from kinetok.motion.formats import (
+    FORMATS,
+    FormatError,
+    SkeletonMotion,
+    draw_clips,
+    each_clip,
+    open_library,
+    read,
+    read_clips,
+    write_amass,
+    write_robot_csv,
+)
 from kinetok.motion.library import ClipLibrary
+from tests.conftest import sway
 
 # frames per second and frames of one file of every format in the collection, and whose body it is
 COLLECTED = {
@@ -198,3 +210,25 @@ def test_no_motion_has_such_a_rate(tmp_path, data_dir, fps):
         FormatError, match=rf"odd_poses\.npz: odd_poses: {fps:.4g} frames per second; a motion has 1 to"
     ):
         read(tmp_path / "odd_poses.npz")
+
+
+def test_the_clips_of_a_library_are_read_one_by_one_and_drawn_unread(tmp_path, monkeypatch):
+    squat = sway("c", 20, loop=False)
+    names = [f"c{number:02d}" for number in range(40)]
+    ClipLibrary.write(tmp_path / "all.safetensors", (replace(squat, name=name) for name in names))
+    ClipLibrary.append(tmp_path / "parts", [replace(squat, name="part")])
+    opened = []
+    monkeypatch.setattr(ClipLibrary, "clip", lambda self, i: (opened.append(i), clip_of(self, i))[1])
+    clips = each_clip(tmp_path / "all.safetensors")
+    assert not opened and next(clips).name == "c00" and opened == [0]
+    opened.clear()
+    drawn = draw_clips([tmp_path / "all.safetensors", tmp_path / "parts"], 6.5 * squat.seconds / 3600, seed=0)
+    assert len(drawn) == len(opened) == 7 and [clip.name for clip in drawn] == sorted(clip.name for clip in drawn)
+    again = draw_clips([tmp_path / "all.safetensors", tmp_path / "parts"], 6.5 * squat.seconds / 3600, seed=1)
+    assert {clip.name for clip in again} != {clip.name for clip in drawn}
+    assert len(draw_clips([tmp_path / "parts"], 100.0, seed=0)) == 1
+    (tmp_path / "parts" / "walk.bvh").write_text("HIERARCHY")
+    assert open_library(tmp_path / "parts") is None and open_library(tmp_path / "walk.txt") is None
+
+
+clip_of = ClipLibrary.clip

@@ -7,7 +7,7 @@ import pytest
 
 from kinetok.config import ConfigError
 from kinetok.sim.batch import BodyState
-from kinetok.sim.tasks.tracking import Failure, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 
 RNG = np.random.default_rng(0)
 
@@ -174,3 +174,14 @@ def test_failure_by_mean_and_by_largest_error(table, bodies, distance, fails):
     assert task.over(body)[0].tolist() == [fails]
     if np.isfinite(distance):
         assert task.error[0].max() == pytest.approx(distance, abs=1e-5)
+
+
+def test_a_table_that_memory_cannot_hold_is_refused_before_it_is_filled(library, monkeypatch):
+    table = ReferenceTable(library)
+    columns = (table.qpos, table.qvel, table.pose, table.target, table.heading, *vars(table.body).values())
+    machine = {"SC_PHYS_PAGES": 100, "SC_PAGE_SIZE": sum(x.nbytes for x in columns if x is not None) // 100}
+    monkeypatch.setattr("os.sysconf", machine.__getitem__)
+    with pytest.raises(ConfigError, match=r"hours of reference frames take 0\.0 GB, and this machine has .*--hours 1"):
+        ReferenceTable(library)
+    machine["SC_PHYS_PAGES"] = 130
+    assert len(ReferenceTable(library).qpos) == len(table.qpos)
