@@ -164,6 +164,37 @@ def test_a_library_grows_and_is_parted(clip, tmp_path):
     assert wrong.exit_code == 1 and "between 0 and 1" in wrong.output and not (tmp_path / "none").exists()
 
 
+def test_what_is_refused_can_be_left_out(clip, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "broken.bvh").write_text("HIERARCHY\nROOT hip\n")
+    write_clip(tmp_path / "folder" / "good.txt", frames(11))
+    out = tmp_path / "all.safetensors"
+    stops = kinetok("clips", "import", tmp_path / "folder", "--out", out)
+    assert stops.exit_code == 1 and "broken.bvh: line" in stops.output and not out.exists()
+    goes_on = kinetok("clips", "import", tmp_path / "folder", "--skip", "--out", out)
+    assert goes_on.exit_code == 0 and "left out " in goes_on.output and "broken.bvh: line" in goes_on.output
+    assert "1 clips, 0.3 s; 1 files were refused" in goes_on.output and [c.name for c in read_clips(out)] == ["good"]
+    nothing = kinetok(
+        "clips", "import", tmp_path / "folder" / "broken.bvh", "--skip", "--out", tmp_path / "n.safetensors"
+    )
+    assert nothing.exit_code == 1 and not (tmp_path / "n.safetensors").exists()
+
+
+def test_joints_unit_and_axis_can_be_named(data_dir, tmp_path):
+    walk = data_dir / "bvh" / "cmu_motionbuilder" / "cmu_12_01_walk.bvh"
+    text = walk.read_text().replace("LeftUpLeg", "XY").replace("LHipJoint", "Q")
+    source, out = tmp_path / "odd.bvh", tmp_path / "odd.safetensors"
+    source.write_text(text)
+    unknown = kinetok("clips", "import", source, "--out", out)
+    assert unknown.exit_code == 1 and "Name them: --part left_thigh=JOINT" in unknown.output
+    words = ("clips", "import", source, "--out", out, "--part", "left_thigh=XY", "--unit", "cmu", "--up", "y")
+    named = kinetok(*words)
+    assert named.exit_code == 0 and "(given)" in named.output, named.output
+    assert "give a part and a joint" in kinetok(*words, "--part", "left_thigh").output
+    small = kinetok("clips", "import", walk, "--out", out, "--unit", "mm")
+    assert small.exit_code == 1 and "the body is 0.0241 m large" in small.output and "--unit" in small.output
+
+
 def test_hours_of_a_library_are_drawn(clip, tmp_path):
     out, json_of = tmp_path / "all.safetensors", tmp_path / "few.json"
     others = [write_clip(tmp_path / "more" / f"c{number}.txt", frames(11)) for number in range(9)]

@@ -1,7 +1,9 @@
 """The import law: which room may import what. `violations` reads a source tree; it imports nothing of it."""
 
 import ast
+import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -133,6 +135,17 @@ def room(parts: list[str]) -> str:
 
 def test_the_package_keeps_the_law():
     assert violations(PACKAGE) == []
+
+
+def test_what_the_package_imports_is_installed_with_it():
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    installed = {re.split(r"[<>=]", line)[0].replace("-", "_") for line in project["dependencies"]}
+    for path in PACKAGE.rglob("*.py"):
+        for node, _ in imports(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or "kinetok"]
+            tops = {name.partition(".")[0] for name in names if name not in EXTRAS}
+            missing = tops - installed - EXTRAS - sys.stdlib_module_names - {"kinetok"}
+            assert not missing, f"{path.name}:{node.lineno}: {missing} is no dependency of the project"
 
 
 def plant(root: Path, files: dict[str, str]) -> Path:

@@ -2,20 +2,49 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
-from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, each_clip, one_clip, option_seed, write_motion
+from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, each_clip, one_clip, option_seed, say, write_motion
 
-option_fps = click.option(
-    "--fps",
-    type=click.FloatRange(1, 1000),
-    default=None,
-    help="Frame rate of files that name none (robot CSV, AMC).",
-)
-option_dialect = click.option(
-    "--dialect", default=None, help="Of robot CSV that leaves it open: lafan1, kimodo or bones-seed."
-)
+UNITS = ["m", "cm", "mm", "in", "cmu"]  # motion/formats/conventions.py
+
+
+def option_told(command):
+    """What files may not say: --fps, --dialect, --unit, --up."""
+    for option in (
+        click.option("--up", type=click.Choice(["y", "z"]), default=None, help="Axis that is up in BVH."),
+        click.option("--unit", type=click.Choice(UNITS), default=None, help="Of BVH.  [default: told by rig or size]"),
+        click.option("--dialect", default=None, help="Of robot CSV: lafan1, kimodo or bones-seed.  [default: told]"),
+        click.option(
+            "--fps",
+            type=click.FloatRange(1, 1000),
+            default=None,
+            help="Frame rate of files that name none (robot CSV, AMC).",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def option_part(command):
+    """--part, of which there may be many, as a dict."""
+
+    def split(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
+        wrong = [pair for pair in given if not all(pair.partition("="))]
+        if wrong:
+            raise click.BadParameter(f"{wrong[0]!r}; give a part and a joint, e.g. left_thigh=Oberschenkel_L")
+        return {part: joint for part, _, joint in (pair.partition("=") for pair in given)}
+
+    return click.option(
+        "--part",
+        "parts",
+        multiple=True,
+        metavar="PART=JOINT",
+        callback=split,
+        help="A joint that no table of rigs knows, e.g. left_thigh=Oberschenkel_L.",
+    )(command)
 
 
 @click.group(cls=Chain)
@@ -51,9 +80,11 @@ def clips_info(paths: tuple[Path, ...]) -> None:
 )
 @click.option("--out", default=None, type=PATHS, help="Library of the repaired motion, ending in .safetensors.")
 @click.option("--character", default=None, help="Body to retarget foreign skeletons to.  [default: humanoid]")
-@option_fps
-@option_dialect
-def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, fps, dialect) -> None:
+@option_told
+@option_part
+def clips_check(
+    paths: tuple[Path, ...], fix: bool, out: Path | None, character: str | None, parts: dict[str, str], **told: Any
+) -> None:
     """Look for what is wrong with motion: lead-ins, jumps, spikes, units, up axis, floor, duplicates.
 
     What has one right repair is repaired by --fix (and by every command that reads recorded motion); the rest is
@@ -74,7 +105,7 @@ def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character:
             left_out.append(_refuse(path, error))
         for file, known in files:
             try:
-                read += [(file, motion) for motion in read_file(file, known, fps=fps, dialect=dialect)]
+                read += [(file, motion) for motion in read_file(file, known, **told)]
             except ValueError as error:
                 left_out.append(_refuse(file, error))
     names = [motion.name for _, motion in read]
@@ -94,7 +125,9 @@ def clips_check(paths: tuple[Path, ...], fix: bool, out: Path | None, character:
             good[pair.part] = False
             left_out.append(f"{labels[pair.part]} (a copy)")
     if out is not None:
-        write_fixed(out, [motion for (_, motion), kept in zip(read, good, strict=True) if kept], left_out, character)
+        write_fixed(
+            out, [motion for (_, motion), kept in zip(read, good, strict=True) if kept], left_out, character, parts
+        )
     if failed:
         raise click.exceptions.Exit(1)
 
@@ -105,7 +138,7 @@ def _refuse(path: Path, error: ValueError) -> str:
     return path.name
 
 
-def write_fixed(out: Path, motions: list, left_out: list[str], character: str | None) -> None:
+def write_fixed(out: Path, motions: list, left_out: list[str], character: str | None, parts: dict[str, str]) -> None:
     """A library of the motions, mended."""
     from kinetok.motion.check import mend
     from kinetok.motion.library import ClipLibrary
@@ -116,7 +149,9 @@ def write_fixed(out: Path, motions: list, left_out: list[str], character: str | 
     if not motions:
         raise ValueError(f"--out {out}: every motion was refused, there is nothing to write")
     mended = [mend(motion)[0] for motion in motions]
-    fitted = [retarget(m, character or "humanoid").clip if isinstance(m, SkeletonMotion) else m for m in mended]
+    fitted = [
+        retarget(m, character or "humanoid", parts=parts).clip if isinstance(m, SkeletonMotion) else m for m in mended
+    ]
     ClipLibrary.write(out, fitted)
     click.echo(f"wrote {out}: {len(fitted)} clips; left out: {', '.join(sorted(left_out)) or 'none'}")
 
@@ -132,12 +167,20 @@ def write_fixed(out: Path, motions: list, left_out: list[str], character: str | 
 @click.option(
     "--character", default=None, help="Body to retarget to.  [default: humanoid for skeletons, for clips their own]"
 )
-@option_fps
-@option_dialect
+@option_told
+@option_part
 @click.option("--half", is_flag=True, default=False, show_default=True, help="Half the bytes (float16), 0.7 mm off.")
 @click.option("--append", is_flag=True, default=False, show_default=True, help="Add to the library that lies at --out.")
+@click.option("--skip", is_flag=True, default=False, show_default=True, help="Leave out what is refused, and say why.")
 def clips_import(
-    paths: tuple[Path, ...], out: Path, character: str | None, fps, dialect, half: bool, append: bool
+    paths: tuple[Path, ...],
+    out: Path,
+    character: str | None,
+    parts: dict[str, str],
+    half: bool,
+    append: bool,
+    skip: bool,
+    **told: Any,
 ) -> None:
     """Read motion files of any known format, alone or in folders, and write one memory-mapped library.
 
@@ -152,10 +195,14 @@ def clips_import(
 
     if out.suffix or not append:
         check_suffix(out, ".safetensors")
-    read = []  # (name, seconds, body)
+    read, left_out = [], []  # (name, seconds, body), errors
+
+    def refuse(error: ValueError) -> None:
+        left_out.append(error)
+        say(f"left out {error}")
 
     def found():
-        for clip in each_clip(paths, character, fps, dialect):
+        for clip in each_clip(paths, character, parts=parts, skip=refuse if skip else None, **told):
             read.append((clip.name, clip.seconds, clip.character))
             if clip.character != read[0][2]:
                 raise ValueError(
@@ -168,8 +215,9 @@ def clips_import(
         ClipLibrary.append(out, found(), dtype="float16" if half else None)
     else:
         ClipLibrary.write(out, found(), dtype="float16" if half else "float32")
-    told = f"{len(read)} clips, {sum(seconds for _, seconds, _ in read):.1f} s"
-    click.echo(f"added to {out}: {told}" if append else f"wrote {out}: {told}")
+    summary = f"{len(read)} clips, {sum(seconds for _, seconds, _ in read):.1f} s"
+    summary += f"; {len(left_out)} files were refused" if left_out else ""
+    click.echo(f"added to {out}: {summary}" if append else f"wrote {out}: {summary}")
 
 
 @clips.command("split")

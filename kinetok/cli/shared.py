@@ -102,14 +102,12 @@ def say(line: str) -> None:
     click.echo(line, err=True)
 
 
-def each_clip(
-    paths: tuple[Path, ...], character: str | None = None, fps: float | None = None, dialect: str | None = None
-):
+def each_clip(paths: tuple[Path, ...], character: str | None = None, **settings):
     """The clips of all paths one after the other; what was repaired or assumed is said on stderr."""
     from kinetok.motion import formats
 
     for path in paths:
-        yield from formats.each_clip(path, character, fps=fps, dialect=dialect, say=say)
+        yield from formats.each_clip(path, character, say=say, **settings)
 
 
 def load_clips(paths: tuple[Path, ...], hours: float | None = None, seed: int = 0):

@@ -43,7 +43,6 @@ SPIKE_ANGLE, SPIKE_SPEED, SPIKE_CALM = 0.2, 12.0, 1 / 3  # rad, rad/s, share of 
 ROOT_FAST = 12.5  # m/s
 LEAD_SPEED, LEAD_REST, LEAD_FRAMES = 30.0, 0.1, 8  # rad/s, median rad from rest, frames
 FROZEN_SECONDS = 0.25
-UNIT_ERROR = 0.1  # quaternion norms further from 1 are worth a note
 SIZE = (0.5, 2.6)  # metres: the rest pose of a body, joints only
 HUMAN = (1.4, 2.1)  # the same for an adult
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "CMU units": 0.0564}
@@ -75,13 +74,11 @@ def check(motion: SkeletonMotion | Clip) -> list[Finding]:
 def mend(motion: M) -> tuple[M, list[Finding]]:
     """The motion with everything repaired that has one right repair, and all findings."""
     found: list[Finding] = []
-    dropped = 0
     motion, signs = _align_signs(motion)
     found += signs
     motion, lead = _drop_lead_in(motion)
-    if lead:
-        dropped = int(lead[0].value or 0)
-        found += lead
+    dropped = int(lead[0].value or 0) if lead else 0
+    found += lead
     for repair in (_mend_spikes, _mend_units):
         motion, more = repair(motion)
         found += _shifted(more, dropped)
@@ -92,44 +89,6 @@ def mend(motion: M) -> tuple[M, list[Finding]]:
         motion, more = _mend_floor(motion)
         found += _shifted(more, dropped)
     return motion, found
-
-
-def mend_frames(
-    root: np.ndarray, local: np.ndarray, joints: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray, list[Finding]]:
-    """Raw frames, before they can be a motion: root (T, 3), local (T, J, 4) of any norm, with holes.
-
-    Quaternions are made unit (a note where the norm was off by more than 0.1). A lone frame that is not finite or has
-    a zero quaternion lies between its neighbours; longer holes and those at the ends are refused and left as they are.
-    """
-    root, local, found = np.array(root, dtype=np.float64), np.array(local, dtype=np.float64), []
-    norms = np.linalg.norm(local, axis=-1)
-    good = np.isfinite(norms) & (norms > 1e-3)
-    holes = {name: ~good[:, j] for j, name in enumerate(joints)}
-    for j, name in enumerate(joints):
-        off = np.abs(norms[good[:, j], j] - 1)
-        if off.size and off.max() > 1e-6:
-            frame = int(np.flatnonzero(good[:, j])[off.argmax()])
-            extra = "; that is far, look at the file" if off.max() > UNIT_ERROR else ""
-            message = f"quaternion of norm {norms[frame, j]:.4g} made unit{extra}"
-            if off.max() > 1e-3:
-                found.append(_finding("norm", "fixed", message, frame=frame, joint=name, value=norms[frame, j]))
-            if extra:
-                found.append(_finding("norm", "note", "norm off by more than 0.1", frame=frame, joint=name))
-        local[good[:, j], j] /= norms[good[:, j], j, None]
-    for j, (name, hole) in enumerate([*holes.items(), ("root position", ~np.isfinite(root.sum(1)))]):
-        for first, last in _runs(hole):
-            if first == last and 0 < first < len(root) - 1:
-                if j < len(joints):
-                    local[first, j] = _between(local[first - 1, j], local[first + 1, j])
-                else:
-                    root[first] = (root[first - 1] + root[first + 1]) / 2
-                message = "a lone frame that holds no rotation or position, laid between its neighbours"
-                found.append(_finding("corrupt", "fixed", message, frame=first, joint=name))
-            else:
-                message = f"frames {first} to {last} hold no rotation or position: cut the motion there"
-                found.append(_finding("corrupt", "refused", message, frame=first, joint=name, value=last - first + 1))
-    return root, local, found
 
 
 def report(findings: Sequence[Finding]) -> str:
@@ -248,8 +207,12 @@ def _drop_lead_in(motion: M) -> tuple[M, list[Finding]]:
     speed = steps.max(1) * motion.fps
     held = int(np.argmax(speed > 1e-3 * motion.fps)) if (speed > 1e-3 * motion.fps).any() else 0
     rest = np.median(np.linalg.norm(rotation.to_rotvec(rotations(motion)[1][0, 1:]), axis=-1)) if len(names) > 1 else 9
-    if speed[held] < LEAD_SPEED or rest > LEAD_REST or len(speed) < held + LEAD_FRAMES + 2:
+    if rest > LEAD_REST:
         return motion, []
+    slow = "begins in the skeleton's rest pose, left slowly: cut that off if it is no part of the motion"
+    noted = [_finding("lead-in", "note", slow, frame=0)] if isinstance(motion, SkeletonMotion) else []
+    if speed[held] < LEAD_SPEED or len(speed) < held + LEAD_FRAMES + 2:
+        return motion, noted
     last = held  # the last step of the blend: the next one is no longer clearly slower
     while last < held + LEAD_FRAMES and (speed[last] > LEAD_SPEED or speed[last + 1] < 0.7 * speed[last]):
         last += 1
@@ -373,7 +336,8 @@ def _mend_units(motion: M) -> tuple[M, list[Finding]]:
             message = f"the body is {size:.3g} m large: {name}; scaled by {scale:.4g} to {size * scale:.2f} m"
             fixed = replace(motion, offsets=motion.offsets * scale, root=motion.root * scale, unit=f"{unit}, {name}")
             return fixed, [_finding("units", "fixed", message, value=size)]
-        message = f"the body is {size:.3g} m large; a person's joints span {HUMAN[0]} to {HUMAN[1]} m: name the unit"
+        span = f"a person's joints span {HUMAN[0]} to {HUMAN[1]} m"
+        message = f"the body is {size:.3g} m large; {span}: name the unit (BVH: --unit)"
         return motion, [_finding("units", "refused", message, value=size)]
     height = float(np.median(np.abs(_root(motion)[:, 2])))
     if height > 10 * size:

@@ -115,7 +115,8 @@ def find_rig(motion: SkeletonMotion, parts: dict[str, str] | None = None) -> Rig
     if missing:
         raise RigError(
             f"motion {motion.name!r}: cannot tell which joints are {', '.join(missing)}; the skeleton has "
-            f"{', '.join(motion.joints)}. Name them: parts={{{missing[0]!r}: <joint>, ...}}"
+            f"{', '.join(motion.joints)}. Name them: --part {missing[0]}=JOINT ..., in Python "
+            f"parts={{{missing[0]!r}: <joint>, ...}}"
         )
     found.setdefault("chest", _meeting(motion.parents, found["left_upper_arm"], found["right_upper_arm"]))
     _check_tree(motion, found)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinetok import rotation
-from kinetok.motion.check import check, mend, mend_frames, report
+from kinetok.motion.check import check, mend, report
 from kinetok.motion.clip import Clip
 from kinetok.motion.formats import read, read_clips
 from kinetok.motion.kinematics import lowest_point
@@ -206,34 +206,6 @@ def test_frames_that_stand_still_are_noted():
     local[40:70], root[40:70] = local[40], root[40]
     found = [f for f in check(replace(motion, local=local, root=root)) if f.kind == "frozen"]
     assert [(f.severity, f.frame) for f in found] == [("note", 40)] and found[0].value == pytest.approx(29 / 60)
-
-
-def test_raw_frames():
-    motion = person()
-    local, root = motion.local.copy(), motion.root.copy()
-    local[:, 1] *= 1.05
-    local[4, 1] *= 1.01
-    local[7, 2] *= 1.4
-    local[20, 3] = np.nan
-    local[30, 5] = 0.0
-    root[33] = np.inf
-    local[60:63, 4] = np.nan
-    root[0] = np.nan
-    root2, local2, findings = mend_frames(root, local, motion.joints)
-    assert kinds(findings) == [
-        ("fixed", "norm", 4, "spine"),
-        ("fixed", "norm", 7, "head"),
-        ("note", "norm", 7, "head"),
-        ("fixed", "corrupt", 20, "left_thigh"),
-        ("refused", "corrupt", 60, "left_foot"),
-        ("fixed", "corrupt", 30, "right_thigh"),
-        ("refused", "corrupt", 0, "root position"),
-        ("fixed", "corrupt", 33, "root position"),
-    ]
-    good = np.isfinite(local2).all(-1)
-    assert not good[60:63, 4].any() and good.sum() == good.size - 3
-    np.testing.assert_allclose(local2[good], motion.local[good], atol=2e-3)
-    np.testing.assert_allclose(root2[1:], motion.root[1:], atol=1e-12)
 
 
 @pytest.mark.parametrize("frames", [2, 3, 4, 9])

@@ -13,7 +13,7 @@ import fnmatch
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -49,10 +49,21 @@ def read_library(path: Path) -> Iterator[Clip]:
     return (library.clip(index) for index in range(len(library)))
 
 
+class Told(TypedDict, total=False):
+    """What a file may not say, and the caller can. fps: of files that name no rate (robot CSV, AMC); dialect: of robot
+    CSV that leaves it open (`robot_csv.DIALECTS`); unit, up: of BVH ("cm", "in", ...; "y" or "z"). None and what a
+    format does not leave open change nothing; what is assumed instead, `source` and `unit` of the motion say."""
+
+    fps: float | None
+    dialect: str | None
+    unit: str | None
+    up: str | None
+
+
 @dataclass(frozen=True)
 class Format:
     """name; suffixes: lower case; sniff: whether a file of such a suffix is one; read: its reader; untold: what the
-    files do not say and the reader takes, of "fps" and "dialect"."""
+    files do not say and the reader takes, keys of Told."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -67,7 +78,7 @@ SAID = ("assumed", "guessed", "made unit")  # of what a reader did that is worth
 FORMATS = (
     Format("DeepMimic", (".txt", ".json"), is_deepmimic, read_deepmimic),
     Format(OWN, (".safetensors",), by_suffix, read_library),
-    Format("BVH", (".bvh",), by_suffix, read_bvh),
+    Format("BVH", (".bvh",), by_suffix, read_bvh, untold=("unit", "up")),
     Format("ASF/AMC", (".amc",), by_suffix, read_amc, untold=("fps",)),
     Format("AMASS", (".npz",), is_amass, read_amass),
     Format("mjlab", (".npz",), is_mjlab, read_mjlab),
@@ -88,34 +99,30 @@ NO_MOTION = (
 )
 
 
-def read(path: Path, *, fps: float | None = None, dialect: str | None = None) -> list[Clip | SkeletonMotion]:
-    """The motions of a file, of a kinetok library, or of every such file in a folder and those in it.
-
-    fps: the frame rate of files that name none (robot CSV, AMC); None is their format's usual one, see `source`.
-    dialect: of robot CSV that leaves it open (`robot_csv.DIALECTS`).
-    """
-    return [motion for file, known in files_of(path) for motion in read_file(file, known, fps=fps, dialect=dialect)]
+def read(path: Path, **told: Unpack[Told]) -> list[Clip | SkeletonMotion]:
+    """The motions of a file, of a kinetok library, or of every such file in a folder and those in it."""
+    return [motion for file, known in files_of(path) for motion in read_file(file, known, **told)]
 
 
 def read_clips(
     path: Path,
     character: str | None = None,
     *,
-    fps: float | None = None,
-    dialect: str | None = None,
     say: Callable[[str], None] = lambda line: None,
+    **told: Unpack[Told],
 ) -> list[Clip]:
     """The motions of a path as clips; see `each_clip`."""
-    return list(each_clip(path, character, fps=fps, dialect=dialect, say=say))
+    return list(each_clip(path, character, say=say, **told))
 
 
 def each_clip(
     path: Path,
     character: str | None = None,
     *,
-    fps: float | None = None,
-    dialect: str | None = None,
+    parts: dict[str, str] | None = None,
     say: Callable[[str], None] = lambda line: None,
+    skip: Callable[[FormatError], None] | None = None,
+    **told: Unpack[Told],
 ) -> Iterator[Clip]:
     """The motions of a path as clips that passed the gate (motion.check), one after the other.
 
@@ -123,13 +130,19 @@ def each_clip(
     are refused, with FormatError; a joint that leaps can be followed half-way and stays in. Recorded skeletons are then
     retargeted to `character`, "humanoid" when None, and so are clips of another body, if one is asked for. `say` hears
     of all this, a line each: what was repaired, what stays in, how well a motion was retargeted. The clips of a library
-    have been through the gate when it was written.
+    have been through the gate when it was written. With `skip`, which hears why, what is refused is left out. parts:
+    part of the body -> joint, for rigs whose joints no table knows; see motion/rigs.py.
     """
     for file, known in files_of(path):
-        for motion in each_motion(file, known, fps=fps, dialect=dialect):
-            if known.name != OWN:
-                motion = _gated(file, motion, say)
-            yield _fit(file, motion, character, say)
+        try:
+            for motion in each_motion(file, known, **told):
+                if known.name != OWN:
+                    motion = _gated(file, motion, say)
+                yield _fit(file, motion, character, parts, say)
+        except FormatError as error:
+            if skip is None:
+                raise
+            skip(error)
 
 
 def open_library(path: Path) -> ClipLibrary | None:
@@ -172,10 +185,16 @@ def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]
     return mended
 
 
-def _fit(path: Path, motion: Clip | SkeletonMotion, character: str | None, say: Callable[[str], None]) -> Clip:
+def _fit(
+    path: Path,
+    motion: Clip | SkeletonMotion,
+    character: str | None,
+    parts: dict[str, str] | None,
+    say: Callable[[str], None],
+) -> Clip:
     try:
         if isinstance(motion, SkeletonMotion):
-            fitted = retarget(motion, character or "humanoid")
+            fitted = retarget(motion, character or "humanoid", parts=parts)
         elif character in (None, motion.character):
             return motion
         else:
@@ -220,19 +239,14 @@ def files_of(path: Path) -> list[tuple[Path, Format]]:
     return [(path, found)]
 
 
-def read_file(
-    path: Path, known: Format, *, fps: float | None = None, dialect: str | None = None
-) -> list[Clip | SkeletonMotion]:
-    """The motions of one file of a known format; see `read`."""
-    return list(each_motion(path, known, fps=fps, dialect=dialect))
+def read_file(path: Path, known: Format, **told: Unpack[Told]) -> list[Clip | SkeletonMotion]:
+    """The motions of one file of a known format."""
+    return list(each_motion(path, known, **told))
 
 
-def each_motion(
-    path: Path, known: Format, *, fps: float | None = None, dialect: str | None = None
-) -> Iterator[Clip | SkeletonMotion]:
+def each_motion(path: Path, known: Format, **told: Unpack[Told]) -> Iterator[Clip | SkeletonMotion]:
     """The motions of one file of a known format, one after the other."""
-    told = {name: value for name, value in (("fps", fps), ("dialect", dialect)) if name in known.untold}
-    motion = known.read(path, **told)
+    motion = known.read(path, **{name: value for name, value in told.items() if name in known.untold})
     for found in (motion,) if isinstance(motion, Clip | SkeletonMotion) else motion:
         if not RATES[0] <= found.fps <= RATES[1]:
             reason = f"{found.fps:.4g} frames per second; a motion has {RATES[0]:g} to {RATES[1]:g}"

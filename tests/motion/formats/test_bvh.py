@@ -86,11 +86,12 @@ def bvhio_positions(path: Path, draft: Path, frames: np.ndarray) -> tuple[list[s
     return [joint.Name for joint in layout], np.array(positions)
 
 
-def test_positions_are_those_of_bvhio(motions, data_dir, tmp_path):
-    """Four frames of every file; bvhio computes in single precision."""
+@pytest.mark.parametrize("count", [4, pytest.param(10**9, marks=pytest.mark.slow)])
+def test_positions_are_those_of_bvhio(motions, data_dir, tmp_path, count):
+    """So many frames of every file, all of them by `make slow`; bvhio computes in single precision."""
     for name, (_, _, metres, up, *_) in FILES.items():
         motion = motions[name]
-        frames = np.linspace(0, len(motion.root) - 1, 4).astype(int)
+        frames = np.linspace(0, len(motion.root) - 1, min(count, len(motion.root))).astype(int)
         names, expected = bvhio_positions(data_dir / name, tmp_path / "part.bvh", frames)
         assert tuple(names) == motion.joints
         expected = (z_up(expected) if up == "y" else expected) * metres

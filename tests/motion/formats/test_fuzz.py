@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 
 from kinetok import rotation
 from kinetok.motion.clip import Clip
-from kinetok.motion.formats import FORMATS, FormatError, read, write_bvh, write_robot_csv
+from kinetok.motion.formats import FORMATS, FormatError, read, read_file, write_bvh, write_robot_csv
 from kinetok.motion.formats.g1 import load_g1
 from kinetok.motion.formats.robot_csv import DIALECTS
 from kinetok.motion.kinematics import kinematics
@@ -363,7 +363,7 @@ def try_to_read(sample: Sample, files: dict[str, bytes], folder: Path) -> bool:
     (known,) = (known for known in FORMATS if known.name == sample.format)
     try:
         with bounded():
-            found = known.read(path)
+            found = read_file(path, known)
             known.sniff(path)
     except FormatError as error:
         assert error.path.name in files and error.where and path.parent.name in str(error), str(error)
@@ -371,7 +371,7 @@ def try_to_read(sample: Sample, files: dict[str, bytes], folder: Path) -> bool:
     finally:
         for name in files:
             (folder / name).unlink()
-    assert all(isinstance(m, Clip | SkeletonMotion) for m in (found if isinstance(found, list) else [found]))
+    assert found and all(isinstance(m, Clip | SkeletonMotion) for m in found)
     return True
 
 

@@ -64,12 +64,12 @@ def test_joint_columns_are_found_by_name(tmp_path, squat):
 
 
 def test_every_collected_file(data_dir):
-    clips = {p: read(p)[0] for p in sorted((data_dir / "g1").glob("*/*.csv")) if p.stat().st_size < 140_000}
-    assert len(clips) == 5
+    clips = {p: read(p)[0] for p in sorted((data_dir / "g1").glob("*/*.csv"))}
+    assert len(clips) == 16
     for path, clip in clips.items():
         assert clip.source.startswith(f"{path.name} ({'kimodo' if 'kimodo' in path.name else 'lafan1'} by the ground")
         low = lowest_point(load_g1("g1"), clip.qpos)
-        assert -0.06 < np.percentile(low, 5) < 0.06, path.name
+        assert -0.04 < np.percentile(low, 5) < 0.01 and abs(np.median(low)) < 0.02, path.name
         up = rotation.rotate(clip.qpos[:, 3:7], np.array([0.0, 0.0, 1.0]))[:, 2]
         assert np.percentile(up, 5) > 0.8, path.name
         assert ((clip.qpos[1:, 3:7] * clip.qpos[:-1, 3:7]).sum(-1) > 0).all()
