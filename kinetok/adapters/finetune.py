@@ -36,6 +36,7 @@ from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.pretrain import THREADS
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
+from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import seeded, torch_threads
@@ -53,10 +54,12 @@ JUDGE = 1_000_000  # added to the seed of a run: the episodes that choose its be
 class FinetuneConfig:
     """task; adapter: its kind and shape; methods: of sft, hindsight, rl, in this order; sft; hindsight; policy: how
     tokens are drawn; samples: control steps of rl, in `rows` worlds; eval_every: samples between evaluations of
-    `eval_episodes` episodes of eval_seconds; save_every: samples between states to resume from, at the next evaluation
-    (the worlds begin anew there, so not too often); critic: widths of the value network on state and task;
-    critic_warmup: first iterations that leave the adapter alone; anchor: pull towards the adapter that rl began with,
-    per nat and step; env: the worlds of rl, in the tokenizer's scene; ppo."""
+    `eval_episodes` episodes of eval_seconds; save_every: samples between states to resume from, at the next
+    evaluation (the worlds begin anew there, so not too often); critic: widths of the value network on state and
+    task; critic_warmup: first iterations that leave the adapter alone; ema: factor of the average of the adapter's
+    weights over updates, which is then what is judged and kept (rl/average.py), 0 for the last ones themselves;
+    anchor: pull towards the adapter that rl began with, per nat and step; env: the worlds of rl, in the tokenizer's
+    scene; ppo."""
 
     task: GoalConfig = TargetConfig()
     adapter: AdapterConfig = CoLAConfig(rank=16, alpha=32.0)
@@ -73,6 +76,7 @@ class FinetuneConfig:
     critic: tuple[int, ...] = (256, 128)
     critic_warmup: int = 6
     anchor: float = 0.0
+    ema: float = 0.0
     env: EnvConfig = EnvConfig(episode_seconds=16.0)
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
@@ -91,6 +95,8 @@ class FinetuneConfig:
                 raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.anchor >= 0:
             raise ConfigError(f"anchor must be at least 0, not {self.anchor}; 0 is none")
+        if not 0 <= self.ema < 1:
+            raise ConfigError(f"ema must be at least 0 and below 1, not {self.ema}; 0 is none")
         if self.eval_seconds < 0.1:
             raise ConfigError(f"eval_seconds must be at least 0.1, not {self.eval_seconds}")
 
@@ -380,6 +386,7 @@ def _reinforce(
         identity={"stage": to_dict(config)} | identity,
         kinds={"stage": FinetuneConfig},
         seed=seed,
+        average=Average(skill.adapted.trainable(), config.ema) if config.ema else None,
     )
 
     story = f"reinforcement learning, {config.samples:,} control steps at most"

@@ -11,7 +11,7 @@ loss that is not finite stops the run, keeps the last good state and dumps the o
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -22,6 +22,7 @@ import torch
 from kinetok.checkpoint import save_state
 from kinetok.logger import Logger
 from kinetok.resume import Part, State
+from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.ppo import Optimizers, PPOConfig, update
@@ -58,7 +59,7 @@ class Progress:
 class Training:
     """The mutable parts of one training, saved and restored together. modules: what is trained, besides the critic, by
     its name in the state; identity: what a run must share with another to go on from it (JSON); kinds: classes of the
-    configs in it."""
+    configs in it; average: of the policy's weights, which is then what is judged and kept."""
 
     def __init__(
         self,
@@ -72,11 +73,14 @@ class Training:
         identity: dict[str, Any],
         kinds: Mapping[str, type],
         seed: int,
+        average: Average | None = None,
     ):
+        self.average = average
         self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
         self.optimizers = Optimizers(policy, critic, config)
         self.generator = seeded(seed)
         parts = {"critic": critic, **modules, "optimizers": self.optimizers, "generator": self.generator}
+        parts |= {"average": average} if average else {}
         self._state = State(out, parts, identity=identity, kinds=kinds)
 
     def train(
@@ -121,17 +125,20 @@ class Training:
                     if not (first and warm):
                         self.policy.observe(rollout.obs)
                     self.critic.observe(rollout.obs)
+                if self.average and train_actor:
+                    self.average.follow()
                 progress.iteration += 1
                 progress.samples += per_iteration
                 due = progress.samples >= min(progress.evaluated + eval_every, samples)
                 if due:
                     progress.evaluated = progress.samples
-                    score = evaluate()
+                    with self.average.standing_in() if self.average else nullcontext():
+                        score = evaluate()
+                        progress.stale += 1
+                        if score.merit > progress.best:
+                            progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
+                            keep(score)
                     metrics |= {f"{prefix}/{name}": value for name, value in score.summary().items()}
-                    progress.stale += 1
-                    if score.merit > progress.best:
-                        progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
-                        keep(score)
                 metrics["reward"] = float(rollout.rewards.mean())  # a step; episodes' sums are of whole episodes alone
                 log.write(progress.samples, metrics | self.world.episode_metrics())
                 if due and (progress.samples - progress.saved >= save_every or progress.samples >= samples):

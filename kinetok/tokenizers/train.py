@@ -18,6 +18,7 @@ import torch
 
 from kinetok.checkpoint import CheckpointError, load_state
 from kinetok.config import ConfigError, at_least, diff, to_dict
+from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
@@ -42,12 +43,12 @@ COUNTS = {
 class PPOStage:
     """samples: control steps to train for; rows: worlds; eval_every: samples between evaluations of `eval_episodes`
     episodes a clip; stop_success, stop_mpjpe_mm: end early when an evaluation reaches both; patience: or when, with
-    stop_success reached, the best score is so many evaluations old; critic_warmup: first
-    iterations that leave the policy alone; log_std: spread of the actions at the first and the last iteration;
-    anchor: pull towards the policy it started from; failure: when training's
-    episodes end; eval_push: evaluations push the root by so many m/s every two seconds; arrivals: share of the episodes
-    that begin in a state of another clip, within `reach` metres of roaming.likeness, so that motions can go over into
-    one another."""
+    stop_success reached, the best score is so many evaluations old; critic_warmup: first iterations that leave the
+    policy alone; log_std: spread of the actions at the first and the last iteration; anchor: pull towards the policy
+    it started from; ema: factor of the average of the weights over updates, which is then what is judged and kept
+    (rl/average.py), 0 for the last ones themselves; failure: when training's episodes end; eval_push: evaluations
+    push the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
+    clip, within `reach` metres of roaming.likeness, so that motions can go over into one another."""
 
     samples: int = 2_000_000
     rows: int = 512
@@ -60,6 +61,7 @@ class PPOStage:
     critic_warmup: int = 0
     log_std: tuple[float, float] = (-2.6, -2.9)
     anchor: float = 0.0
+    ema: float = 0.0
     failure: Failure = Failure()
     eval_push: float = 0.0
     arrivals: float = 0.0
@@ -71,6 +73,8 @@ class PPOStage:
     def __post_init__(self) -> None:
         at_least(self, 1, COUNTS)
         at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
+        if not 0 <= self.ema < 1:
+            raise ConfigError(f"ema must be at least 0 and below 1, not {self.ema}; 0 is none")
         if not (0 <= self.arrivals <= 1 and self.reach > 0):
             raise ConfigError(f"arrivals is a share and reach above 0 m, not {self.arrivals} and {self.reach}")
 
@@ -119,6 +123,7 @@ def train_ppo(
         identity=identity,
         kinds=KINDS | {"stage": PPOStage},
         seed=seed,
+        average=Average(actor.parameters(), config.ema) if config.ema else None,
     )
 
     def evaluate() -> TrackingScore:

@@ -12,6 +12,7 @@ from kinetok.checkpoint import CheckpointError, load_state, save_state
 from kinetok.config import to_dict
 from kinetok.logger import read_metrics
 from kinetok.resume import refuse_changed
+from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
@@ -71,7 +72,7 @@ class Found:
 class Run:
     """A training of Line in Room; `kept` are the weights that were kept, by merit."""
 
-    def __init__(self, out, *, seed=0, stage=None, **settings):
+    def __init__(self, out, *, seed=0, stage=None, ema=0.0, **settings):
         torch.manual_seed(seed)
         self.actor, self.kept, self.stage = Line(), [], stage or Stage()
         self.training = Training(
@@ -84,6 +85,7 @@ class Run:
             identity={"stage": to_dict(self.stage), "seed": seed},
             kinds={"stage": Stage},
             seed=seed,
+            average=Average(self.actor.parameters(), ema) if ema else None,
         )
 
     def train(self, merits=None, **options):
@@ -127,6 +129,21 @@ def test_a_resumed_run_is_the_unbroken_one(tmp_path, stop_at):
     assert tensors.keys() == expected.keys() and all(torch.equal(tensors[k], expected[k]) for k in tensors)
     assert meta == expected_meta and progress.best == 3.0
     assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
+
+
+def test_with_an_average_it_is_judged_and_kept_and_resumed(tmp_path):
+    whole = Run(tmp_path / "whole", ema=0.5)
+    whole.train()
+    plain = Run(tmp_path / "plain")
+    plain.train()
+    assert torch.equal(whole.actor.line.weight, plain.actor.line.weight)  # what is learned from is not the average
+    assert not torch.equal(whole.kept[-1][1], plain.kept[-1][1])
+    Run(tmp_path / "cut", stage=Stage(samples=256), ema=0.5).train()
+    cut = Run(tmp_path / "cut", ema=0.5)
+    cut.train(merits=[2.0, 3.0])
+    tensors, expected = (state(tmp_path / name)[0] for name in ("cut", "whole"))
+    assert tensors.keys() == expected.keys() and all(torch.equal(tensors[k], expected[k]) for k in tensors)
+    assert torch.equal(cut.kept[-1][1], whole.kept[-1][1])
 
 
 def test_saved_at_some_evaluations_alone_a_resumed_run_is_the_unbroken_one(tmp_path):

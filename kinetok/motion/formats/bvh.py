@@ -124,7 +124,13 @@ def read_lines(path: Path) -> list[str]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise FormatError(path, f"line {line}", f"byte 0x{data[error.start]:02x} is not UTF-8 text") from None
+        remedy = (
+            "save it as UTF-8, e.g. iconv -f utf-16 -t utf-8"
+            if data[:2] in (b"\xff\xfe", b"\xfe\xff")
+            else ("if its names are in Latin-1: iconv -f latin1 -t utf-8")
+        )
+        reason = f"byte 0x{data[error.start]:02x} is not UTF-8 text; {remedy}"
+        raise FormatError(path, f"line {line}", reason) from None
     if not text.strip():
         raise FormatError(path, "line 1", "the file is empty")
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
