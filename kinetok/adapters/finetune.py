@@ -158,6 +158,24 @@ class Skill:
         )
 
 
+def mean_of(skills: Sequence[Skill]) -> Skill:
+    """A skill whose adapter's tensors are the mean of those of several checkpoints of one run.
+
+    Steadier than each of them, the more so the further apart they lie (docs/log.md, "The average of a wandering
+    policy"). Of adapters of different runs the mean is nothing; of different shapes or priors it is refused.
+    """
+    first, *others = skills
+    for other in others:
+        changed = diff(to_dict(first.adapted.config), to_dict(other.adapted.config))
+        if changed or fingerprint(first.prior.gpt) != fingerprint(other.prior.gpt):
+            raise ConfigError(f"these adapters differ: {'; '.join(changed) or 'they are of different priors'}")
+    states = [skill.adapted.adapter_state() for skill in skills]
+    mean = {name: torch.stack([state[name].double() for state in states]).mean(0) for name in states[0]}
+    adapted = copy.deepcopy(first.adapted)
+    adapted.load_adapter_state_({name: tensor.to(states[0][name].dtype) for name, tensor in mean.items()})
+    return replace(first, adapted=adapted)
+
+
 def _find(adapter: Path, noted: str) -> str:
     """The prior that the adapter in this directory notes: its directory, or its packaged name."""
     if (adapter / noted).is_dir():

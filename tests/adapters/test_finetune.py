@@ -13,7 +13,7 @@ from made import make_prior
 from kinetok.adapters import ADAPTERS, CoLAConfig, LoRAConfig
 from kinetok.adapters import finetune as room
 from kinetok.adapters.adapted import Adapted, fingerprint, parameters_of
-from kinetok.adapters.finetune import FinetuneConfig, Skill, finetune, reshaped
+from kinetok.adapters.finetune import FinetuneConfig, Skill, finetune, mean_of, reshaped
 from kinetok.adapters.rlft import TokenPolicyConfig, play
 from kinetok.checkpoint import ADAPTER, CheckpointError, load_artifact, load_state, save_artifact
 from kinetok.config import ConfigError, override
@@ -196,6 +196,19 @@ def test_every_adapter_runs_and_every_task(models, tmp_path, kind, task):
     assert skill.adapted.cond_dim == width == Skill.from_pretrained(tmp_path).adapted.cond_dim
     played = play(skill.controller(0), skill.task, skill.prior, episodes=1, seconds=0.2, threads=1)
     assert np.isfinite(played.score.merit)
+
+
+def test_the_mean_of_checkpoints_by_hand(plain, models, tmp_path):
+    one, other = Skill.from_pretrained(plain), Skill.from_pretrained(plain)
+    state = {name: tensor + 1.0 for name, tensor in one.adapted.adapter_state().items()}
+    other.adapted.load_adapter_state_(state)
+    mean_of([one, other, other]).save_pretrained(tmp_path / "mean")
+    assert same(weights(plain), one.adapted.adapter_state())  # those it is made of are as they were
+    for name, tensor in weights(tmp_path / "mean").items():
+        torch.testing.assert_close(tensor, weights(plain)[name] + 2 / 3)
+    run(models, tmp_path / "cola", reshaped(replace(TINY, samples=64), task="target", adapter="cola"))
+    with pytest.raises(ConfigError, match=r"these adapters differ: kind: .*"):
+        mean_of([one, Skill.from_pretrained(tmp_path / "cola")])
 
 
 def test_another_adapter_keeps_what_it_has_in_common():
