@@ -193,11 +193,18 @@ def from_mjcf(name: str, xml: str, roles: dict, roles_file: str = "roles") -> Ch
         parents=tuple(int(p) - 1 for p in model.body_parentid[1:]),
         kp=kp,
         kd=model.dof_damping[dof] - model.actuator_biasprm[:, 2],
-        torque=np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf),
+        torque=_torque_limits(model),
         ball=ball,
         hinge=hinge,
         dof=dof,
     )
+
+
+def _torque_limits(model: mujoco.MjModel) -> np.ndarray:
+    """N m (nu,) that each actuator can give: by its own forcerange or its joint's actuatorfrcrange, inf for neither."""
+    joint = model.actuator_trnid[:, 0]
+    own = np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf)
+    return np.minimum(own, np.where(model.jnt_actfrclimited[joint], model.jnt_actfrcrange[joint, 1], np.inf))
 
 
 def known_roles(model: mujoco.MjModel) -> dict:

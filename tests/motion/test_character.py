@@ -222,6 +222,16 @@ def test_a_g1_of_another_source_has_the_roles_of_the_built_in_one(data_dir, tmp_
     assert Character.load("menagerie:unitree_g1").roles == {}
 
 
+def test_torque_limits_of_actuators_and_of_joints():
+    def torque(joint: str, actuator: str) -> float:
+        text = GOOD.replace('<joint name="j"', f'<joint name="j" {joint}').replace('kp="1"', f'kp="1" {actuator}')
+        return from_mjcf("c", text, {}).torque[0]
+
+    assert GOOD.count('<joint name="j"') == 1 and torque("", "") == np.inf
+    assert torque("", 'forcerange="-9 9"') == 9 and torque('actuatorfrcrange="-7 7"', "") == 7
+    assert torque('actuatorfrcrange="-7 7"', 'forcerange="-9 9"') == 7
+
+
 def test_load_messages(tmp_path):
     with pytest.raises(ConfigError, match=r"unknown character 'humanoit'.*path of an MJCF file ending in \.xml"):
         Character.load("humanoit")
