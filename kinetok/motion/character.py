@@ -208,8 +208,8 @@ def _torque_limits(model: mujoco.MjModel) -> np.ndarray:
 
 
 def known_roles(model: mujoco.MjModel) -> dict:
-    """The roles of the built-in character all of whose bodies and joints a model has, as the Unitree G1 of the
-    menagerie, of mjlab and of others has; {} where there is none."""
+    """The roles of the built-in character that a model is by its names: it has every body and joint that they name, as
+    the Unitree G1 of the menagerie, of mjlab and of others has; {} where there is none."""
     for name in BUILT_IN:
         roles = read_roles(ASSETS / f"{name}.json")
         try:

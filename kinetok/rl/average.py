@@ -5,8 +5,8 @@
     with average.standing_in():                    # here the parameters are the average
         score = evaluate()
 
-A PPO policy wanders about what it can do; its evaluations differ by more than it learns between them. It is not what
-the paper does (GPC keeps the last iterate); docs/log.md, "The average of a wandering policy".
+A PPO policy wanders about what it can do; its evaluations differ by more than it learns between them (docs/log.md, "The
+average of a wandering policy"). Ours, not of a paper.
 """
 
 from collections.abc import Iterable, Iterator

@@ -17,6 +17,7 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
+from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.motion.check import FLOOR_WRONG, mend, report
 from kinetok.motion.clip import Clip
@@ -148,7 +149,7 @@ def each_clip(
 def open_library(path: Path) -> ClipLibrary | None:
     """The kinetok library at a path, a file or a folder of nothing else, unread; None where something else is there."""
     if path.is_dir():
-        own = all(known.name == OWN for _, known in files_of(path)) and any(path.glob("*.safetensors"))
+        own = all(known.name == OWN and file.parent == path for file, known in files_of(path))
     else:
         own = path.suffix == ".safetensors" and path.is_file()
     return ClipLibrary.open(path) if own else None
@@ -199,8 +200,10 @@ def _fit(
             return motion
         else:
             fitted = _on_another(motion, character)
-    except RigError as error:
-        raise FormatError(path, "skeleton", str(error)) from None
+    except ConfigError:  # of the character, not of this file
+        raise
+    except ValueError as error:
+        raise FormatError(path, "skeleton" if isinstance(error, RigError) else motion.name, str(error)) from None
     found, mm = fitted.report, 1000
     say(
         f"{found.name}: on {fitted.clip.character} ({found.rig}), joints {mm * found.residual_mean:.0f} mm from their "

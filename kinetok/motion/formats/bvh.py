@@ -127,7 +127,7 @@ def read_lines(path: Path) -> list[str]:
         remedy = (
             "save it as UTF-8, e.g. iconv -f utf-16 -t utf-8"
             if data[:2] in (b"\xff\xfe", b"\xfe\xff")
-            else ("if its names are in Latin-1: iconv -f latin1 -t utf-8")
+            else "if its names are in Latin-1: iconv -f latin1 -t utf-8"
         )
         reason = f"byte 0x{data[error.start]:02x} is not UTF-8 text; {remedy}"
         raise FormatError(path, f"line {line}", reason) from None

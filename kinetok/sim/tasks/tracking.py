@@ -112,6 +112,8 @@ def _tabulated(body: Character, clip: Clip, frames: int, control_hz: int) -> dic
 
 def _refuse_too_large(frames: int, size: int, control_hz: int) -> None:
     """Refuse a table of so many frames of so many bytes that the machine's memory cannot hold."""
+    if not hasattr(os, "sysconf"):  # Windows does not say
+        return
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if frames * size > LARGEST * there:
         raise ConfigError(

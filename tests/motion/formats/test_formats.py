@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinetok.config import ConfigError
 from kinetok.motion.clip import Clip
 from kinetok.motion.formats import (
     FORMATS,
@@ -212,6 +213,18 @@ def test_no_motion_has_such_a_rate(tmp_path, data_dir, fps):
         read(tmp_path / "odd_poses.npz")
 
 
+def test_what_cannot_be_fitted_is_of_its_file_and_what_is_asked_for_is_not(tmp_path, data_dir, tiny):
+    lines = (data_dir / "bvh" / "cmu_motionbuilder" / "cmu_12_01_walk.bvh").read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if line.startswith("Frames"))
+    (tmp_path / "short.bvh").write_text("\n".join([*lines[:at], "Frames: 2", *lines[at + 1 : at + 4], ""]))
+    refused = []
+    assert list(each_clip(tmp_path / "short.bvh", skip=refused.append)) == []
+    assert "short.bvh: short: " in str(refused[0]) and "fewer than two frames at 30" in str(refused[0])
+    (tmp_path / "tiny.xml").write_text(tiny.xml)
+    with pytest.raises(ConfigError, match="no body is named"):
+        list(each_clip(data_dir / "bvh" / "snu_mass" / "walk.bvh", str(tmp_path / "tiny.xml"), skip=refused.append))
+
+
 def test_the_clips_of_a_library_are_read_one_by_one_and_drawn_unread(tmp_path, monkeypatch):
     squat = sway("c", 20, loop=False)
     names = [f"c{number:02d}" for number in range(40)]
@@ -227,6 +240,8 @@ def test_the_clips_of_a_library_are_read_one_by_one_and_drawn_unread(tmp_path, m
     again = draw_clips([tmp_path / "all.safetensors", tmp_path / "parts"], 6.5 * squat.seconds / 3600, seed=1)
     assert {clip.name for clip in again} != {clip.name for clip in drawn}
     assert len(draw_clips([tmp_path / "parts"], 100.0, seed=0)) == 1
+    ClipLibrary.append(tmp_path / "parts" / "more", [squat])
+    assert open_library(tmp_path / "parts") is None  # what lies deeper is read as well, so it is no one library
     (tmp_path / "parts" / "walk.bvh").write_text("HIERARCHY")
     assert open_library(tmp_path / "parts") is None and open_library(tmp_path / "walk.txt") is None
 
