@@ -215,10 +215,14 @@ class Adapted(nn.Module):
         )
 
     @staticmethod
-    def from_pretrained(path: Path | str, gpt: GPT, *, base: Path | str = "the GPT given") -> "Adapted":
-        """Load an adapter beside the GPT it was trained with. base: where `gpt` came from, for messages."""
+    def from_pretrained(
+        path: Path | str, gpt: GPT, *, base: Path | str = "the GPT given", rebase: bool = False
+    ) -> "Adapted":
+        """Load an adapter beside the GPT it was trained with, or, to `rebase` it, beside another one of the same shape.
+        base: where `gpt` came from, for messages."""
         artifact = load_artifact(path, "adapter", ADAPTER)
-        require_parent(artifact, "gpt", fingerprint(gpt), base)
+        if not rebase:
+            require_parent(artifact, "gpt", fingerprint(gpt), base)
         config = from_dict(AdaptedConfig, artifact.config["adapted"], str(artifact.path / ADAPTER.config))
         adapted = Adapted(gpt, config.adapter, config.cond_dim)
         adapted.load_adapter_state_(artifact.tensors)

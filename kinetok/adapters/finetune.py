@@ -137,10 +137,15 @@ class Skill:
 
     @staticmethod
     def from_pretrained(
-        path: Path | str, prior: Prior | Path | str | None = None, tokenizer: Path | str | None = None
+        path: Path | str,
+        prior: Prior | Path | str | None = None,
+        tokenizer: Path | str | None = None,
+        *,
+        rebase: bool = False,
     ) -> "Skill":
         """Load an adapter by directory or packaged name, with its prior: `prior`, itself or its directory, if given,
-        else the one at the noted place. tokenizer: directory of the prior's, if it is not where the prior says."""
+        else the one at the noted place. tokenizer: directory of the prior's, if it is not where the prior says. rebase:
+        whether `prior` may be another than the one it was trained with."""
         artifact = load_artifact(path, "adapter", ADAPTER)
         noted = artifact.config["skill"]
         if noted is None:
@@ -150,7 +155,7 @@ class Skill:
             base = _find(artifact.path, noted["prior"]) if prior is None else str(prior)
             prior = Prior.from_pretrained(base, tokenizer)
         return Skill(
-            adapted=Adapted.from_pretrained(artifact.path, prior.gpt, base=base),
+            adapted=Adapted.from_pretrained(artifact.path, prior.gpt, base=base, rebase=rebase),
             prior=prior,
             base=base,
             task=from_dict(pick(TASKS, noted["task"]["kind"], "task")[0], noted["task"]),
@@ -193,6 +198,7 @@ def finetune(
     base: Path | str,
     clips: Sequence[Clip] = (),
     start: Path | str | None = None,
+    rebase: bool = False,
     seed: int = 0,
     threads: int = 0,
     quiet: bool = False,
@@ -200,11 +206,12 @@ def finetune(
     """Run the methods that are not finished yet, write the best skill to `out` and return it.
 
     base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft and hindsight. start:
-    the adapter, of the same shape and prior, that rl begins with. threads: of physics and torch; 0 is every core for
+    the adapter, of the same shape and prior, that rl begins with; rebase: of another prior of the same shape, such as
+    this one's predecessor. threads: of physics and torch; 0 is every core for
     physics and two for torch.
     """
     with torch_threads(threads or THREADS):
-        return _finetune(prior, config, out, base, clips, start, seed=seed, threads=threads, quiet=quiet)
+        return _finetune(prior, config, out, base, clips, start, rebase, seed=seed, threads=threads, quiet=quiet)
 
 
 def _finetune(
@@ -214,14 +221,15 @@ def _finetune(
     base: Path | str,
     clips: Sequence[Clip],
     start: Path | str | None,
+    rebase: bool,
     *,
     seed: int,
     threads: int,
     quiet: bool,
 ) -> Skill:
-    _check(prior, config, clips, start, out)
+    _check(prior, config, clips, start, rebase, out)
     torch.manual_seed(seed)
-    adapted = _adapted(prior, config, base, start)
+    adapted = _adapted(prior, config, base, start, rebase)
     skill = Skill(adapted=adapted, prior=prior, base=str(base), task=config.task, policy=config.policy)
     places = {method: out / method for method in config.methods[:-1]} | {config.methods[-1]: out}
     for place in places.values():
@@ -251,7 +259,9 @@ def _finetune(
     return skill
 
 
-def _check(prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: Path | str | None, out: Path) -> None:
+def _check(
+    prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: Path | str | None, rebase: bool, out: Path
+) -> None:
     """Refuse what cannot be done, before any of it is."""
     if "sft" in config.methods and not clips:
         raise ConfigError("supervised fine-tuning needs example clips: --clips PATH")
@@ -263,6 +273,8 @@ def _check(prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: P
             raise ConfigError(
                 f"clip {clip.name!r} is of {clip.character!r}, the prior moves {body!r}; retarget it first"
             )
+    if rebase and start is None:
+        raise ConfigError("--rebase takes the skill of --from over to another prior; give that skill")
     if start is not None and config.methods != ("rl",):
         raise ConfigError("another skill's adapter is where reinforcement learning begins: --from needs --method rl")
     if start is not None and out.exists() and out.resolve() == locate(start, ADAPTER).resolve():
@@ -270,13 +282,13 @@ def _check(prior: Prior, config: FinetuneConfig, clips: Sequence[Clip], start: P
     in_scene(config.env, prior.tokenizer.config.scene)
 
 
-def _adapted(prior: Prior, config: FinetuneConfig, base: Path | str, start: Path | str | None) -> Adapted:
+def _adapted(prior: Prior, config: FinetuneConfig, base: Path | str, start: Path | str | None, rebase: bool) -> Adapted:
     """The prior with a fresh adapter, or with that of the skill at `start`."""
     columns = task_of(config.task, prior, 1).layout["task"]
     shape = AdaptedConfig(adapter=config.adapter, cond_dim=columns.stop - columns.start)
     if start is None:
         return Adapted(prior.gpt, shape.adapter, shape.cond_dim)
-    adapted = Adapted.from_pretrained(start, prior.gpt, base=base)
+    adapted = Adapted.from_pretrained(start, prior.gpt, base=base, rebase=rebase)
     changed = diff(AdaptedConfig(adapter=adapted.config, cond_dim=adapted.cond_dim), shape)
     if changed:
         raise ConfigError(

@@ -45,10 +45,13 @@ def pretrain(tokenizer, paths, hours, out, preset, settings, threads, seed) -> N
     "--clips", "paths", multiple=True, type=PATHS, help="Motions for sft and hindsight: file, library or folder."
 )
 @click.option("--from", "start", default=None, type=PATHS, help="A fine-tuned skill whose adapter rl begins with.")
+@click.option(
+    "--rebase", is_flag=True, default=False, help="Take the skill of --from over to --prior, another one of its shape."
+)
 @option_hours
 @click.option("--out", required=True, type=PATHS, help="Run directory; an interrupted run goes on from it.")
 @configured("laptop")
-def finetune(prior, task, adapter, method, paths, hours, start, out, preset, settings, threads, seed) -> None:
+def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, preset, settings, threads, seed) -> None:
     """Bend the frozen prior to a task with a small adapter: by examples (sft), by demonstrations of the task that are
     made of --clips (hindsight), by reward (rl), or one after the other.
 
@@ -57,6 +60,7 @@ def finetune(prior, task, adapter, method, paths, hours, start, out, preset, set
     kinetok finetune --task target --method hindsight,rl --clips gaits.safetensors --out runs/target
     kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
     kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
+    kinetok finetune --from runs/target --prior runs/newer --rebase --out runs/newer-target
     kinetok sample --adapter runs/target --out target.mp4
     """
     from dataclasses import replace
@@ -72,9 +76,10 @@ def finetune(prior, task, adapter, method, paths, hours, start, out, preset, set
         base = prior or "humanoid-gpt"
         model = Prior.from_pretrained(base)
     else:
-        skill = Skill.from_pretrained(start, prior)
+        skill = Skill.from_pretrained(start, prior, rebase=rebase)
         model, base = skill.prior, skill.base
         config = replace(config, task=skill.task, adapter=skill.adapted.config)
     config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
     config = override(replace(config, methods=tuple(method.split(","))), settings)
-    bend(model, config, out, base=base, clips=load_clips(paths, hours, seed), start=start, seed=seed, threads=threads)
+    clips = load_clips(paths, hours, seed)
+    bend(model, config, out, base=base, clips=clips, start=start, rebase=rebase, seed=seed, threads=threads)

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, load_artifact
+from kinetok.checkpoint import Artifact, CheckpointError, load_artifact
 from kinetok.config import ConfigError, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.data import TokenDataset, record
@@ -59,6 +59,8 @@ class PretrainConfig:
     iterations of batch samples; lr falls by a cosine to lr_end after warmup iterations. weight_decay: of matrices.
     label_smoothing. ema: factor of the averaged weights. state_noise: standard deviations. held_out: share of worlds.
     eval_every: iterations between evaluations, saves included.
+    start: prior of the same shape, by directory or packaged name, that training begins as, state statistics included:
+    after a change of its tokenizer or its clips, when skills that bend it are to go on (`rebase` of adapters.finetune).
     """
 
     width: int = 192
@@ -86,6 +88,7 @@ class PretrainConfig:
     held_out: float = 0.05
     eval_every: int = 500
     refine: RefineConfig = RefineConfig(rounds=0)
+    start: str = ""
 
     def gpt(self, layout: TokenLayout, state_dim: int) -> GPTConfig:
         """The shape of the GPT for these tokens and states."""
@@ -131,11 +134,16 @@ def pretrain(
         "frames": hashlib.sha256(library.frames.tobytes()).hexdigest(),
         "seed": seed,
     }
+    shape = config.gpt(tokenizer.layout, tokenizer.sizes["state"])
+    start = _start(config.start, shape) if config.start else None
     out.mkdir(parents=True, exist_ok=True)
     data = _recorded(tokenizer, library, config, out / "tokens.safetensors", identity, threads=threads, quiet=quiet)
     torch.manual_seed(seed)
-    gpt = GPT(config.gpt(tokenizer.layout, data.states.shape[1]))
+    gpt = GPT(shape)
     gpt.set_state_statistics_(*data.statistics())
+    if start is not None:
+        gpt.load_state_dict({name[4:]: tensor for name, tensor in start.tensors.items() if name.startswith("gpt.")})
+        identity |= {"start": start.hash}
 
     plain = out / "plain" if config.refine.rounds else out
 
@@ -269,6 +277,15 @@ def _optimizer(gpt: GPT, config: PretrainConfig) -> torch.optim.Optimizer:
     rest = [p for p in gpt.parameters() if p.ndim < 2]
     groups = [{"params": matrices, "weight_decay": config.weight_decay}, {"params": rest, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.95), fused=True)
+
+
+def _start(path: str, shape: GPTConfig) -> Artifact:
+    """The prior that training begins with, its state statistics included."""
+    artifact = load_artifact(path, kind="prior")
+    changed = diff(artifact.config["gpt"], to_dict(shape))
+    if changed:
+        raise ConfigError(f"start {path} is a prior of another shape: {'; '.join(changed)}")
+    return artifact
 
 
 def _recorded(

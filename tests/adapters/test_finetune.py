@@ -293,6 +293,7 @@ WRONG = {  # config; options from the clips and a finished run; message
     ),
     "start and examples": (BOTH, lambda clips, skill: {"clips": clips, "start": skill}, "--from needs --method rl"),
     "no start": (TINY, lambda clips, skill: {"start": "nowhere"}, "there is no directory nowhere"),
+    "rebase what": (TINY, lambda clips, skill: {"rebase": True}, "--rebase takes the skill of --from over to another"),
     "start is a prior": (TINY, lambda clips, skill: {"start": "humanoid-gpt"}, "humanoid-gpt"),
 }
 
@@ -321,6 +322,13 @@ def test_the_adapter_of_another_prior_is_refused_by_both_hashes(models, plain, t
         with pytest.raises(CheckpointError, match=re.escape(message)):
             refused()
     assert not (tmp_path / "out").exists()
+    old = Adapted.from_pretrained(plain, Prior.from_pretrained(models / "prior").gpt).adapter_state()
+    nothing = replace(TINY, critic_warmup=100)  # no update of the adapter: what comes out is what was taken over
+    skill = finetune(other, nothing, tmp_path / "out", base=tmp_path / "prior", start=plain, rebase=True, threads=1)
+    assert skill.adapted.adapter_state().keys() == old.keys()
+    moved = [name for name, tensor in skill.adapted.adapter_state().items() if not torch.equal(tensor, old[name])]
+    assert all(name.startswith("conditioner.norm.") for name in moved)  # what it has seen of the task goes on
+    assert Skill.from_pretrained(tmp_path / "out").prior.gpt.norm.weight.equal(other.gpt.norm.weight)
 
 
 @pytest.mark.parametrize(

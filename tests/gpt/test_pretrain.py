@@ -85,6 +85,18 @@ def test_pretraining_leaves_an_artifact_that_finds_its_tokenizer(tokenizer, toke
     assert str(tmp_path) not in (out / "config.json").read_text()
 
 
+def test_it_begins_as_another_prior(tokenizer, clips, tmp_path):
+    first = pretrain(tokenizer, clips, SMALL, tmp_path / "first", threads=1, quiet=True)
+    still = replace(SMALL, start=str(tmp_path / "first"), lr=0.0, lr_end=0.0, held_out=0.0)
+    again = pretrain(tokenizer, clips[:1], still, tmp_path / "again", threads=1, quiet=True)
+    assert all(torch.equal(t, again.gpt.state_dict()[name]) for name, t in first.gpt.state_dict().items())
+    moved = pretrain(tokenizer, clips[:1], replace(still, lr=1e-3), tmp_path / "moved", threads=1, quiet=True)
+    assert not torch.equal(moved.gpt.norm.weight, first.gpt.norm.weight)
+    with pytest.raises(ConfigError, match=r"first is a prior of another shape: width: 16 -> 32"):
+        pretrain(tokenizer, clips, replace(still, width=32), tmp_path / "wider", threads=1, quiet=True)
+    assert not (tmp_path / "wider").exists()
+
+
 def test_a_resumed_run_equals_an_unbroken_one(tokenizer, clips, tmp_path, monkeypatch):
     pretrain(tokenizer, clips, SMALL, tmp_path / "whole", threads=1, quiet=True)
     saved = resume.save_state
