@@ -117,11 +117,12 @@ def score(
     guidance: float = 1.0,
     reference: bool = False,
     anchor: Adapted | None = None,
+    bonus: bool = True,
 ) -> Scored:
     """What the policy says now of tokens (N, S) drawn with the mask keep (N, S, D, K), differentiably.
 
     One teacher-forced pass. reference: with the KL from the base; anchor: with the KL from this adapted model; each at
-    the cost of a pass without gradient.
+    the cost of a pass without gradient. bonus: whether gradients flow through the entropy too; without, a tenth faster.
     """
     _check(adapted, temperature)
     logits, plain = adapted(state, c, tokens) / temperature, None
@@ -131,6 +132,8 @@ def score(
         logits = guided(plain, logits, guidance)
     log_p = F.log_softmax(restrict(logits, keep), dim=-1)
     taken = log_p.gather(-1, adapted.base.split(tokens)[..., None])
+    if not (bonus or reference or anchor is not None):
+        log_p = log_p.detach()
     log_p = log_p.masked_fill(~keep, 0.0)  # where p = 0: p log p is 0, not nan
     p = log_p.exp() * keep
 

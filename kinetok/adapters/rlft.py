@@ -114,6 +114,7 @@ class TokenPolicy:
             guidance=config.guidance,
             reference=config.kl > 0,
             anchor=self.anchor,
+            bonus=config.entropy > 0,
         )
         entropy = found.entropy.mean()
         loss, metrics = -config.entropy * entropy, {"entropy": entropy.detach()}

@@ -81,6 +81,9 @@ def test_score_says_what_draw_said(head, kind, top_p, temperature):
     assert (scored.kl >= -1e-5).all() and (scored.entropy >= -1e-5).all()
     again = draw(adapted, state, c, uniforms(adapted, len(state), seeded()), **settings)
     assert torch.equal(again.tokens, drawn.tokens) and torch.equal(again.keep, drawn.keep)
+    bare = score(adapted, state, c, drawn.tokens, drawn.keep, temperature=temperature, bonus=False)
+    assert torch.equal(bare.log_prob, scored.log_prob) and torch.equal(bare.entropy, scored.entropy)
+    assert bare.log_prob.requires_grad and scored.entropy.requires_grad and not bare.entropy.requires_grad
 
 
 @heads
