@@ -340,6 +340,7 @@ def _same_run(
 def prior_card(prior: Prior, config: PretrainConfig, data: TokenDataset, metrics: dict[str, float], seed: int) -> str:
     """The model card: use, training, inputs and outputs, results and limits."""
     layout, size = prior.tokenizer.layout, sum(p.numel() for p in prior.gpt.parameters())
+    begun = "from an earlier prior" if config.start else "from nothing"
     chance = math.log(layout.vocabulary)
     held = (
         f"Held out ({config.held_out:.0%} of the worlds, iteration {metrics['iteration']:.0f} of {config.iterations}): "
@@ -368,7 +369,7 @@ frozen tokenizer {prior.tokenizer.hash[:12]} turns them into joint torques.
   {config.transitions} changes of clip per second, code noise {config.code_noise}. Seed {seed}.
 - Clips: {", ".join(prior.clips)}.
 - Training: {config.iterations} iterations of {config.batch}, AdamW {config.lr}, label smoothing
-  {config.label_smoothing}, EMA {config.ema}, state noise {config.state_noise}.
+  {config.label_smoothing}, EMA {config.ema}, state noise {config.state_noise}; {begun}.
 - Refined by its own roll-outs: {refined}.
 - It holds {len(prior.starts.qpos)} start states of the clips, so that it runs without them.
 
