@@ -207,8 +207,7 @@ def finetune(
 
     base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft and hindsight. start:
     the adapter, of the same shape and prior, that rl begins with; rebase: of another prior of the same shape, such as
-    this one's predecessor. threads: of physics and torch; 0 is every core for
-    physics and two for torch.
+    this one's predecessor. threads: of physics and torch; 0 is every core for physics and two for torch.
     """
     with torch_threads(threads or THREADS):
         return _finetune(prior, config, out, base, clips, start, rebase, seed=seed, threads=threads, quiet=quiet)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import CheckpointError, load_artifact, locate, require_parent, save_artifact
+from kinetok.checkpoint import Artifact, CheckpointError, load_artifact, locate, require_parent, save_artifact
 from kinetok.config import from_dict, to_dict
 from kinetok.gpt.data import Starts
 from kinetok.gpt.model import GPT, GPTConfig
@@ -81,8 +81,7 @@ class Prior:
             place = "the tokenizer given"
         require_parent(artifact, "tokenizer", tokenizer.hash, place)
         gpt = GPT(from_dict(GPTConfig, artifact.config["gpt"]))
-        weights = {name[4:]: tensor for name, tensor in artifact.tensors.items() if name.startswith("gpt.")}
-        gpt.load_state_dict(weights)
+        gpt.load_state_dict(gpt_weights(artifact))
         return Prior(
             gpt=gpt.eval(),
             tokenizer=tokenizer,
@@ -90,6 +89,11 @@ class Prior:
             clips=tuple(artifact.config["clips"]),
             starts=Starts.of(artifact.tensors),
         )
+
+
+def gpt_weights(artifact: Artifact) -> dict[str, Tensor]:
+    """The weights of the GPT in a prior's artifact, by their names in it."""
+    return {name[4:]: tensor for name, tensor in artifact.tensors.items() if name.startswith("gpt.")}
 
 
 def noted_path(tokenizer: Path | str, prior: Path | str) -> str:

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from kinetok.checkpoint import Artifact, CheckpointError, load_artifact
 from kinetok.config import ConfigError, diff, from_dict, to_dict
-from kinetok.gpt.controller import Prior, noted_path
+from kinetok.gpt.controller import Prior, gpt_weights, noted_path
 from kinetok.gpt.data import TokenDataset, record
 from kinetok.gpt.model import GPT, GPTConfig
 from kinetok.gpt.refine import RefineConfig, refine
@@ -142,7 +142,7 @@ def pretrain(
     gpt = GPT(shape)
     gpt.set_state_statistics_(*data.statistics())
     if start is not None:
-        gpt.load_state_dict({name[4:]: tensor for name, tensor in start.tensors.items() if name.startswith("gpt.")})
+        gpt.load_state_dict(gpt_weights(start))
         identity |= {"start": start.hash}
 
     plain = out / "plain" if config.refine.rounds else out
