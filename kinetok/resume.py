@@ -37,8 +37,9 @@ class State:
         *,
         identity: dict[str, Any],
         kinds: Mapping[str, type],
+        name: str = "state",
     ):
-        self.path, self.parts, self.identity, self.kinds = out / "state.safetensors", parts, identity, kinds
+        self.path, self.parts, self.identity, self.kinds = out / f"{name}.safetensors", parts, identity, kinds
 
     def restore(self) -> tuple[dict[str, Any], dict[str, Any]] | None:
         """Bring every part to where it was saved; the meta and what else was kept, or None where there is no state.

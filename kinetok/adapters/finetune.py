@@ -36,6 +36,7 @@ from kinetok.gpt.controller import Prior, noted_path
 from kinetok.gpt.pretrain import THREADS
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
+from kinetok.rl import ranks
 from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
@@ -207,8 +208,10 @@ def finetune(
 
     base: the prior's directory or packaged name, noted in the artifact. clips: examples for sft and hindsight. start:
     the adapter, of the same shape and prior, that rl begins with; rebase: of another prior of the same shape, such as
-    this one's predecessor. threads: of physics and torch; 0 is every core for physics and two for torch.
+    this one's predecessor. threads: of physics and torch; 0 is every core for physics and two for torch. Several
+    processes may train rl together (rl/ranks.py).
     """
+    quiet = quiet or ranks.rank() > 0
     with torch_threads(threads or THREADS):
         return _finetune(prior, config, out, base, clips, start, rebase, seed=seed, threads=threads, quiet=quiet)
 
@@ -278,6 +281,8 @@ def _check(
         raise ConfigError("another skill's adapter is where reinforcement learning begins: --from needs --method rl")
     if start is not None and out.exists() and out.resolve() == locate(start, ADAPTER).resolve():
         raise ConfigError(f"--from and --out are the same folder, {out}; choose another --out")
+    if config.methods != ("rl",):
+        ranks.alone(f"--method {','.join(config.methods)}")
     in_scene(config.env, prior.tokenizer.config.scene)
 
 
@@ -399,9 +404,10 @@ def _keep(skill: Skill, config: FinetuneConfig, out: Path, story: str, start: st
 def _reinforce(
     skill: Skill, config: FinetuneConfig, out: Path, identity: dict, *, seed: int, threads: int, quiet: bool
 ) -> None:
-    task = task_of(config.task, skill.prior, config.rows)
+    rows, threads = ranks.share(config.rows, "rows"), ranks.threads(threads)
+    task = task_of(config.task, skill.prior, rows)
     world = in_scene(config.env, skill.prior.tokenizer.config.scene)
-    env = Env(world, task, rows=config.rows, threads=threads, seed=seed)
+    env = Env(world, task, rows=rows, threads=threads, seed=ranks.own(seed))
     begun = copy.deepcopy(skill.adapted).requires_grad_(False) if config.anchor else None
     policy = TokenPolicy(skill.adapted, skill.prior.tokenizer, config.policy, begun, config.anchor)
     torch.manual_seed(seed)  # an earlier method may have run in this process or in another one

@@ -62,6 +62,7 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
     kinetok finetune --from runs/target --prior runs/newer --rebase --out runs/newer-target
     kinetok sample --adapter runs/target --out target.mp4
+    Reward in four processes: torchrun --nproc-per-node 4 -m kinetok.cli finetune --from runs/target --out runs/further
     """
     from dataclasses import replace
 
@@ -70,6 +71,7 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     from kinetok.adapters.finetune import finetune as bend
     from kinetok.config import override, pick
     from kinetok.gpt.controller import Prior
+    from kinetok.rl.ranks import joined
 
     config = pick(presets.FINETUNE, preset, "preset")()
     if start is None:
@@ -82,4 +84,5 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
     config = override(replace(config, methods=tuple(method.split(","))), settings)
     clips = load_clips(paths, hours, seed)
-    bend(model, config, out, base=base, clips=clips, start=start, rebase=rebase, seed=seed, threads=threads)
+    with joined():
+        bend(model, config, out, base=base, clips=clips, start=start, rebase=rebase, seed=seed, threads=threads)

@@ -47,6 +47,8 @@ def _use_device(_: click.Context, __: click.Parameter, name: str) -> None:
         return
     import torch
 
+    if name == "cuda" and "LOCAL_RANK" in os.environ:  # torchrun: one GPU for each process
+        name = f"cuda:{os.environ['LOCAL_RANK']}"
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:  # what torch raises differs from build to build
@@ -57,6 +59,8 @@ def _use_device(_: click.Context, __: click.Parameter, name: str) -> None:
             f"torch cannot use {name!r} ({reason}); here there is {found}. A GPU needs a build of torch for it"
         ) from error
     torch.set_default_device(name)
+    if torch.get_default_device().type == "cuda":
+        torch.cuda.set_device(torch.get_default_device())
 
 
 option_device = click.option(

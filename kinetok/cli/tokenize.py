@@ -37,15 +37,19 @@ def tokenize_fit(paths, hours, out, stages, preset, settings, threads, seed) -> 
     from-scratch (end-to-end PPO alone), tiny (tests).
     Examples: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
     kinetok tokenize fit --clips walk.txt --out runs/robust --preset robust --set start=humanoid-teacher
+    PPO in four processes: torchrun --nproc-per-node 4 -m kinetok.cli tokenize fit --stages ppo --clips ... --out ...
     """
     from kinetok import presets
     from kinetok.config import override, pick
+    from kinetok.rl.ranks import joined
     from kinetok.tokenizers.fit import fit
 
     if stages:
         settings = (*settings, f"stages={stages}")
     config = override(pick(presets.FIT, preset, "preset")(), settings)
-    fit(load_clips(paths, hours, seed), config, out, seed=seed, threads=threads)
+    clips = load_clips(paths, hours, seed)
+    with joined():
+        fit(clips, config, out, seed=seed, threads=threads)
 
 
 @tokenize.command("encode")

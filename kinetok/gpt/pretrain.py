@@ -34,6 +34,7 @@ from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.resume import State
+from kinetok.rl import ranks
 from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.roaming import REACH
@@ -123,6 +124,7 @@ def pretrain(
     packaged name, noted so that the prior finds it again. threads: of physics and torch; 0 is every core for
     physics and two for torch.
     """
+    ranks.alone("pretraining")
     if not tokenizer.hash:
         raise ConfigError(
             "this tokenizer has no hash; save it, then load it with MotionTokenizer.from_pretrained(path)"

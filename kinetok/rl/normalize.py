@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from kinetok.rl import ranks
+
 
 class RunningNorm(nn.Module):
     """Normalises x (..., D) to zero mean and unit variance, clipped to +-`clip`.
@@ -27,12 +29,17 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def observe(self, x: Tensor) -> None:
-        """Merge a batch (..., D) into the statistics (Chan et al. 1979)."""
+        """Merge a batch (..., D), and those of the other ranks, into the statistics (Chan et al. 1979)."""
         x = x.reshape(-1, x.shape[-1])
         if not torch.isfinite(x).all():
             raise FloatingPointError("observations hold a value that is not finite")
-        new, total = float(len(x)), float(self.count) + len(x)
-        mean, var = x.mean(0), x.var(0, unbiased=False)
+        new = float(len(x) * ranks.size())
+        total = float(self.count) + new
+        own, var = x.mean(0), x.var(0, unbiased=False)
+        mean = own.clone()
+        ranks.average_((mean,))
+        var = var + (own - mean) ** 2
+        ranks.average_((var,))
         delta = mean - self.mean
         share = new / total
         self.var.copy_(self.var * (1 - share) + var * share + delta**2 * share * (1 - share))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from kinetok.config import ConfigError
+from kinetok.rl import ranks
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.rollout import Rollout
@@ -97,22 +98,25 @@ def update(
     train_actor: bool = True,
     done: float = 0.0,
 ) -> dict[str, float]:
-    """`epochs` passes of minibatch steps over a rollout; returns means of the losses and diagnostics. done: the
-    share of the training that is.
+    """`epochs` passes of minibatch steps over a rollout, and those of the other ranks (ranks.py); returns means of the
+    losses and diagnostics. done: the share of the training that is.
 
     Raises FloatingPointError before any parameter moves by a loss that is not finite.
     """
     obs, taken = rollout.obs.flatten(0, 1), {name: x.flatten(0, 1) for name, x in rollout.taken.items()}
     advantages, targets = advantages.flatten(), targets.flatten()
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-6)
+    everyone = ranks.gathered(advantages)
+    advantages = (advantages - everyone.mean()) / (everyone.std() + 1e-6)
+    weights = [*critic.parameters(), *(optimizers.parameters if train_actor else ())]
+    size = ranks.share(config.minibatch, "ppo.minibatch")
     sums: dict[str, Tensor] = {}
     steps = 0
     for _ in range(config.epochs):
-        for minibatch in torch.randperm(len(obs), generator=generator).split(config.minibatch):
+        for minibatch in torch.randperm(len(obs), generator=generator).split(size):
             optimizers.actor.zero_grad(set_to_none=True)
             optimizers.critic.zero_grad(set_to_none=True)
             means: dict[str, Tensor] = {}
-            for ids in minibatch.split(CHUNK if obs.device.type == "cpu" else config.minibatch):
+            for ids in minibatch.split(CHUNK if obs.device.type == "cpu" else size):
                 value_loss = (critic(obs[ids]) - targets[ids]).pow(2).mean()
                 metrics: dict[str, Tensor] = {"value_loss": value_loss}
                 loss = value_loss
@@ -127,6 +131,8 @@ def update(
                 (share * loss).backward()
                 for name, value in metrics.items():
                     means[name] = means.get(name, torch.zeros(())) + share * value.detach()
+            ranks.average_([weight.grad for weight in weights if weight.grad is not None])
+            ranks.average_(means.values())
             nn.utils.clip_grad_norm_(critic.parameters(), config.max_grad_norm)
             optimizers.critic.step()
             if train_actor:

@@ -6,22 +6,25 @@
 
 `out` receives metrics.jsonl and state.safetensors: a later call with the same identity goes on bit for bit where
 that state was written. The first rollout of a fresh policy only sets the normalisers. A reward, an observation or a
-loss that is not finite stops the run, keeps the last good state and dumps the offending rollout.
+loss that is not finite stops the run, keeps the last good state and dumps the offending rollout. Several processes may
+train together (ranks.py); `world` is then this one's share.
 """
 
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from kinetok.checkpoint import save_state
+from kinetok.checkpoint import CheckpointError, save_state
 from kinetok.logger import Logger
 from kinetok.resume import Part, State
+from kinetok.rl import ranks
 from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
@@ -78,10 +81,11 @@ class Training:
         self.average = average
         self.out, self.world, self.policy, self.critic, self.config = out, world, policy, critic, config
         self.optimizers = Optimizers(policy, critic, config)
-        self.generator = seeded(seed)
+        self.generator = seeded(ranks.own(seed))
         parts = {"critic": critic, **modules, "optimizers": self.optimizers, "generator": self.generator}
         parts |= {"average": average} if average else {}
-        self._state = State(out, parts, identity=identity, kinds=kinds)
+        identity = identity | ({"ranks": ranks.size()} if ranks.size() > 1 else {})
+        self._state = State(out, parts, identity=identity, kinds=kinds, name=ranks.named("state"))
 
     def train(
         self,
@@ -107,9 +111,10 @@ class Training:
         alone. warm: the policy's normalisers come from an earlier training, and the first rollout does not reset them.
         """
         progress = self.resume()
-        per_iteration = self.world.rows * self.config.horizon
+        per_iteration = self.world.rows * self.config.horizon * ranks.size()
+        quiet, files = quiet or ranks.rank() > 0, None if ranks.rank() else self.out
         start = progress.samples + per_iteration
-        with Logger(self.out, total=samples, title=title, start=start, stride=per_iteration, quiet=quiet) as log:
+        with Logger(files, total=samples, title=title, start=start, stride=per_iteration, quiet=quiet) as log:
             obs = torch.as_tensor(self.world.reset(spread=True))
             while progress.samples < samples and not finished(progress):
                 done = min(progress.samples / samples, 1.0)
@@ -133,11 +138,11 @@ class Training:
                 if due:
                     progress.evaluated = progress.samples
                     with self.average.standing_in() if self.average else nullcontext():
-                        score = evaluate()
+                        score = ranks.first(evaluate)
                         progress.stale += 1
                         if score.merit > progress.best:
                             progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
-                            keep(score)
+                            ranks.first(partial(keep, score))
                     metrics |= {f"{prefix}/{name}": value for name, value in score.summary().items()}
                 metrics["reward"] = float(rollout.rewards.mean())  # a step; episodes' sums are of whole episodes alone
                 log.write(progress.samples, metrics | self.world.episode_metrics())
@@ -180,7 +185,7 @@ class Training:
                 raise FloatingPointError(f"{int(bad.sum())} of {bad.numel()} rewards are not finite")
             yield
         except FloatingPointError as error:
-            dump = self.out / "bad_rollout.safetensors"
+            dump = self.out / f"{ranks.named('bad_rollout')}.safetensors"
             save_state(dump, {"obs": rollout.obs, "rewards": rollout.rewards, **rollout.taken}, {})
             left = (
                 f"the last good state in {self._state.path} is untouched"
@@ -199,7 +204,13 @@ class Training:
     def resume(self) -> Progress:
         """Take up the state in `out`; a fresh Progress where there is none. CheckpointError if it is another run's."""
         before = self._state.restore()
-        if before is None:
-            return Progress()
-        self.world.load_state_dict(json.loads(before[0]["env"]))
-        return Progress(**before[0]["progress"])
+        progress = Progress(**before[0]["progress"]) if before else Progress()
+        samples = ranks.gathered(torch.tensor([progress.samples])).tolist()
+        if len(set(samples)) > 1:
+            raise CheckpointError(
+                f"the states in {self.out}, one of each process, are of {' and '.join(map(str, samples))} samples: "
+                "they were not saved together; remove them to begin anew"
+            )
+        if before:
+            self.world.load_state_dict(json.loads(before[0]["env"]))
+        return progress

@@ -20,6 +20,7 @@ from torch import Tensor
 from kinetok.config import at_least
 from kinetok.logger import Logger
 from kinetok.resume import State
+from kinetok.rl import ranks
 from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
@@ -91,6 +92,7 @@ def distill(
     mirrored: which clips are the mirror images of what their teacher knows; empty for none. parents: the teachers'
     hashes, kept in the artifact; a state that had others is refused.
     """
+    ranks.alone("distillation")
     if len(teachers) != len(table.names):
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene

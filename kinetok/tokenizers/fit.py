@@ -32,6 +32,7 @@ from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.resume import refuse_changed
+from kinetok.rl import ranks
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import Progress
@@ -125,7 +126,8 @@ def new_tokenizer(config: TokenizerConfig, table: ReferenceTable, seed: int) -> 
 
 
 def fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int = 0, threads: int = 0) -> MotionTokenizer:
-    """Run the stages that are not finished yet and write the best tokenizer to `out`."""
+    """Run the stages that are not finished yet and write the best tokenizer to `out`. Of the stages, `ppo` may be
+    trained by several processes (rl/ranks.py)."""
     with torch_threads(threads or torch.get_num_threads()):
         return _fit(clips, config, out, seed=seed, threads=threads)
 
@@ -198,6 +200,14 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         Console().print(clip_table(names, {"teacher": taught[: len(names)]}))
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
     best = max(scores, key=lambda stage: scores[stage].merit)
+    ranks.first(lambda: _publish(out, best, scores[best], table.names, taught, started))
+    return MotionTokenizer.from_pretrained(out)
+
+
+def _publish(
+    out: Path, best: str, score: TrackingScore, names: Sequence[str], taught: np.ndarray, started: float
+) -> None:
+    """Copy the best stage's artifact to `out`, and show how well it follows each clip."""
     artifact = load_artifact(out / best)
     save_artifact(
         out,
@@ -207,10 +217,9 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         card=(artifact.path / "README.md").read_text(encoding="utf-8"),
         parents=artifact.parents,
     )
-    found = {best: np.stack([scores[best].success, scores[best].mpjpe_mm], axis=1)}
-    Console().print(clip_table(table.names, found if np.isnan(taught).all() else found | {"teacher": taught}))
-    print(f"best stage: {best}; {scores[best].summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
-    return MotionTokenizer.from_pretrained(out)
+    found = {best: np.stack([score.success, score.mpjpe_mm], axis=1)}
+    Console().print(clip_table(names, found if np.isnan(taught).all() else found | {"teacher": taught}))
+    print(f"best stage: {best}; {score.summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
 
 
 def clip_table(names: Sequence[str], found: Mapping[str, np.ndarray]) -> Table:
@@ -243,6 +252,7 @@ def _taught_numbers(folder: Path, names: Sequence[str], teachers: int) -> np.nda
 
 def train_teachers(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, threads: int) -> None:
     """One expert per clip, `config.workers` at a time on one core each; finished ones are left alone."""
+    ranks.alone("a teacher for each clip")
     jobs = [
         (clip, _others(clip, clips, config), config, out / clip.name, seed)
         for clip in clips

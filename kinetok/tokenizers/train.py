@@ -18,6 +18,7 @@ import torch
 
 from kinetok.checkpoint import CheckpointError, load_state
 from kinetok.config import ConfigError, at_least, diff, to_dict
+from kinetok.rl import ranks
 from kinetok.rl.average import Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
@@ -102,13 +103,14 @@ def train_ppo(
     refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
     tracking = TrackingConfig(future=future, failure=config.failure, reward=config.reward)
-    task = Tracking(tracking, table, rows=config.rows)
+    rows, threads = ranks.share(config.rows, "rows"), ranks.threads(threads)
+    task = Tracking(tracking, table, rows=rows)
     if config.arrivals:
         origins = others or table
         share, reach = config.arrivals, config.reach
-        task = Arriving(tracking, table, origins, rows=config.rows, share=share, reach=reach)
+        task = Arriving(tracking, table, origins, rows=rows, share=share, reach=reach)
         identity |= {"others": list(origins.names)}
-    env = Env(in_scene(config.env, scene), task, rows=config.rows, threads=threads, seed=seed)
+    env = Env(in_scene(config.env, scene), task, rows=rows, threads=threads, seed=ranks.own(seed))
     torch.manual_seed(seed)
     critic = Critic(env.obs_size, config.critic, actor.config.activation)
     anchor = copy.deepcopy(actor) if config.anchor else None
