@@ -194,7 +194,7 @@ def _find(adapter: Path, noted: str) -> str:
 def finetune(
     prior: Prior,
     config: FinetuneConfig,
-    out: Path,
+    out: Path | str,
     *,
     base: Path | str,
     clips: Sequence[Clip] = (),
@@ -211,6 +211,7 @@ def finetune(
     this one's predecessor. threads: of physics and torch; 0 is every core for physics and two for torch. Several
     processes may train rl together (rl/ranks.py).
     """
+    out = Path(out)
     quiet = quiet or ranks.rank() > 0
     with torch_threads(threads or THREADS):
         return _finetune(prior, config, out, base, clips, start, rebase, seed=seed, threads=threads, quiet=quiet)

@@ -111,7 +111,7 @@ def pretrain(
     tokenizer: MotionTokenizer,
     clips: Sequence[Clip],
     config: PretrainConfig,
-    out: Path,
+    out: Path | str,
     *,
     tokenizer_path: Path | str = "",
     seed: int = 0,
@@ -124,6 +124,7 @@ def pretrain(
     packaged name, noted so that the prior finds it again. threads: of physics and torch; 0 is every core for
     physics and two for torch.
     """
+    out = Path(out)
     ranks.alone("pretraining")
     if not tokenizer.hash:
         raise ConfigError(

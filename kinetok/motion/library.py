@@ -63,8 +63,9 @@ class ClipLibrary:
         return ClipLibrary(parts=(part,))
 
     @staticmethod
-    def write(path: Path, clips: Iterable[Clip], *, dtype: Dtype = "float32") -> None:
+    def write(path: Path | str, clips: Iterable[Clip], *, dtype: Dtype = "float32") -> None:
         """Write the clips as one file, one after the other; the file appears whole or not at all."""
+        path = Path(path)
         clips = _begun(clips)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = _temporary(path)
@@ -75,13 +76,14 @@ class ClipLibrary:
             temporary.unlink(missing_ok=True)
 
     @staticmethod
-    def append(path: Path, clips: Iterable[Clip], *, dtype: Dtype | None = None) -> None:
+    def append(path: Path | str, clips: Iterable[Clip], *, dtype: Dtype | None = None) -> None:
         """Add clips to a library; without dtype they are stored as the last part is.
 
         A folder gains one part, whatever its size, also from several writers at once. A single file (.safetensors) is
         written anew with the clips behind and then replaced: time and disk in proportion to it, one writer at a time.
         Both happen whole or not at all.
         """
+        path = Path(path)
         clips = _begun(clips)
         old = ClipLibrary.open(path) if path.exists() and (path.is_file() or _part_paths(path)) else None
         wanted: Dtype = dtype or (_dtype(old.parts[-1]) if old else "float32")
@@ -110,8 +112,9 @@ class ClipLibrary:
             temporary.unlink(missing_ok=True)
 
     @staticmethod
-    def open(path: Path, *, mirror: bool = False) -> "ClipLibrary":
+    def open(path: Path | str, *, mirror: bool = False) -> "ClipLibrary":
         """Read the index of a file, or of all parts in a folder; frames are read from disk when they are sampled."""
+        path = Path(path)
         paths = _part_paths(path) if path.is_dir() else [path]
         if not paths:
             raise FormatError(path, "folder", "holds no part of a clip library (*.safetensors)")

@@ -21,8 +21,9 @@ AZIMUTHS = (180.0, 138.0, 90.0)  # degrees; the camera looks towards -x, at its 
 ELEVATION, MARGIN = -8.0, 1.35  # degrees; height of the picture in heights of the character
 
 
-def write_portrait(path: Path, character: Character, *, size: tuple[int, int] = (320, 480)) -> None:
+def write_portrait(path: Path | str, character: Character, *, size: tuple[int, int] = (320, 480)) -> None:
     """Write a PNG of three views of the character standing, side by side, each of size (width, height)."""
+    path = Path(path)
     if path.suffix != ".png":
         raise ValueError(f"{path}: a portrait is a PNG; the name must end in .png")
     qpos = character.stand()

@@ -65,8 +65,9 @@ def render_frames(
     return _render(character, qpos, _cameras(qpos, fps, distance, elevation), size, ghost, caption, markers)
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> None:
     """Encode images (H, W, 3) uint8 as H.264 (yuv420p, so sides must be even); the file appears whole or not at all."""
+    path = Path(path)
     frames = iter(frames)
     try:
         first = next(frames)
@@ -96,7 +97,7 @@ def render_task(
 
 
 def write_strip(
-    path: Path,
+    path: Path | str,
     character: Character,
     qpos: np.ndarray,
     *,
@@ -111,6 +112,7 @@ def write_strip(
 
     markers, distance, elevation: as in render_frames.
     """
+    path = Path(path)
     picked = np.linspace(0, len(qpos) - 1, columns * rows).round().astype(int)
     shown = None if markers is None else [markers[t] for t in picked]
     # one heading for all stills, which 1e-3 frames per second gives: the camera goes along but does not turn

@@ -44,8 +44,9 @@ class TokenStream:
     tokenizer: str
     simulated: np.ndarray
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write one safetensors file, whole or not at all."""
+        path = Path(path)
         tensors = {"tokens": self.tokens}
         for name in ("qpos", "qvel", "simulated"):
             tensors[name] = torch.from_numpy(np.ascontiguousarray(getattr(self, name)))
@@ -53,8 +54,9 @@ class TokenStream:
         save_state(path, tensors, meta | {"tokenizer": self.tokenizer})
 
     @staticmethod
-    def load(path: Path) -> "TokenStream":
+    def load(path: Path | str) -> "TokenStream":
         """Read a file written by `save`; anything else is a CheckpointError."""
+        path = Path(path)
         tensors, meta = load_state(path)
         if meta.get("kind") != "tokens":
             raise CheckpointError(f"{path} holds no tokens; write one with `kinetok tokenize encode`")

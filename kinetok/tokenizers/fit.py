@@ -125,9 +125,12 @@ def new_tokenizer(config: TokenizerConfig, table: ReferenceTable, seed: int) -> 
     return tokenizer
 
 
-def fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int = 0, threads: int = 0) -> MotionTokenizer:
+def fit(
+    clips: Sequence[Clip], config: FitConfig, out: Path | str, *, seed: int = 0, threads: int = 0
+) -> MotionTokenizer:
     """Run the stages that are not finished yet and write the best tokenizer to `out`. Of the stages, `ppo` may be
     trained by several processes (rl/ranks.py)."""
+    out = Path(out)
     with torch_threads(threads or torch.get_num_threads()):
         return _fit(clips, config, out, seed=seed, threads=threads)
 

@@ -248,3 +248,11 @@ def test_a_spoiled_index_is_refused(tmp_path, walk, change, message):
     save_file(load_file(path) | change, path, {"kind": "clips", "character": "humanoid"})
     with pytest.raises(FormatError, match=message):
         read_clips(path)
+
+
+def test_a_place_may_be_a_string(path, walk, getup, tmp_path):
+    own = f"{tmp_path}/own/clips.safetensors"
+    ClipLibrary.write(own, [walk])
+    ClipLibrary.append(own, [getup])
+    assert ClipLibrary.open(own).names == ClipLibrary.open(path).names
+    assert [clip.name for clip in read_clips(own)] == [walk.name, getup.name]

@@ -100,13 +100,13 @@ NO_MOTION = (
 )
 
 
-def read(path: Path, **told: Unpack[Told]) -> list[Clip | SkeletonMotion]:
+def read(path: Path | str, **told: Unpack[Told]) -> list[Clip | SkeletonMotion]:
     """The motions of a file, of a kinetok library, or of every such file in a folder and those in it."""
     return [motion for file, known in files_of(path) for motion in read_file(file, known, **told)]
 
 
 def read_clips(
-    path: Path,
+    path: Path | str,
     character: str | None = None,
     *,
     say: Callable[[str], None] = lambda line: None,
@@ -117,7 +117,7 @@ def read_clips(
 
 
 def each_clip(
-    path: Path,
+    path: Path | str,
     character: str | None = None,
     *,
     parts: dict[str, str] | None = None,
@@ -134,6 +134,7 @@ def each_clip(
     have been through the gate when it was written. With `skip`, which hears why, what is refused is left out. parts:
     part of the body -> joint, for rigs whose joints no table knows; see motion/rigs.py.
     """
+    path = Path(path)
     for file, known in files_of(path):
         try:
             for motion in each_motion(file, known, **told):
@@ -146,8 +147,9 @@ def each_clip(
             skip(error)
 
 
-def open_library(path: Path) -> ClipLibrary | None:
+def open_library(path: Path | str) -> ClipLibrary | None:
     """The kinetok library at a path, a file or a folder of nothing else, unread; None where something else is there."""
+    path = Path(path)
     if path.is_dir():
         own = all(known.name == OWN and file.parent == path for file, known in files_of(path))
     else:
@@ -155,7 +157,7 @@ def open_library(path: Path) -> ClipLibrary | None:
     return ClipLibrary.open(path) if own else None
 
 
-def draw_clips(paths: Sequence[Path], hours: float, seed: int, **settings: Any) -> list[Clip]:
+def draw_clips(paths: Sequence[Path | str], hours: float, seed: int, **settings: Any) -> list[Clip]:
     """Clips drawn from everything at the paths until there are so many hours of them; settings: of `each_clip`.
 
     Of kinetok libraries nothing else is read, so they may be larger than memory.
@@ -221,8 +223,9 @@ def _on_another(clip: Clip, character: str) -> Retargeted:
     return retarget(skeleton, character, parts=None if family else parts)
 
 
-def files_of(path: Path) -> list[tuple[Path, Format]]:
+def files_of(path: Path | str) -> list[tuple[Path, Format]]:
     """The motion files at a path, in it and in its folders, and their formats."""
+    path = Path(path)
     if path.is_dir():
         named = [(file, _format(file)) for file in sorted(path.rglob("*")) if file.is_file()]
         files = [(file, known) for file, known in named if known]
