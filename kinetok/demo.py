@@ -14,8 +14,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from kinetok.adapters.finetune import Skill
 from kinetok.adapters.rlft import play
+from kinetok.adapters.skill import Skill
 from kinetok.checkpoint import PACKAGED
 from kinetok.evaluate import measure
 from kinetok.gpt.controller import Prior, roll

@@ -23,8 +23,8 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from kinetok import metrics
-from kinetok.adapters.finetune import Skill
 from kinetok.adapters.rlft import Controller, TokenPolicy, play
+from kinetok.adapters.skill import Skill
 from kinetok.config import ConfigError, pick
 from kinetok.gpt.controller import Prior, PriorController, Recording, roll
 from kinetok.motion.character import Character

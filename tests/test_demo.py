@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kinetok.adapters.finetune import Skill
 from kinetok.adapters.rlft import play
+from kinetok.adapters.skill import Skill
 from kinetok.checkpoint import ADAPTER, packaged
 from kinetok.demo import CLIPS, PRIOR, SKILL
 from kinetok.gpt.controller import Prior, roll

@@ -9,8 +9,8 @@ from made import make_clips, make_prior, make_tokenizer
 
 from kinetok.adapters import LoRAConfig
 from kinetok.adapters.adapted import Adapted
-from kinetok.adapters.finetune import Skill
 from kinetok.adapters.rlft import TokenPolicyConfig
+from kinetok.adapters.skill import Skill
 from kinetok.checkpoint import CheckpointError
 from kinetok.config import ConfigError
 from kinetok.evaluate import (

@@ -195,7 +195,7 @@ class Adapted(nn.Module):
         """Write the adapter directory: adapter_config.json, adapter_model.safetensors, README.md.
 
         base: name or place of the prior that was bent, noted for readers; card: the README, None for a short one;
-        skill: what finetune.Skill says of the task, JSON; parents: role -> hash of what else it was made from.
+        skill: what skill.Skill says of the task, JSON; parents: role -> hash of what else it was made from.
         """
         identity, config = fingerprint(self.base), AdaptedConfig(adapter=self.config, cond_dim=self.cond_dim)
         trainable, frozen, share = parameters_of(self)

@@ -67,8 +67,9 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     from dataclasses import replace
 
     from kinetok import presets
-    from kinetok.adapters.finetune import Skill, reshaped
     from kinetok.adapters.finetune import finetune as bend
+    from kinetok.adapters.finetune import reshaped
+    from kinetok.adapters.skill import Skill
     from kinetok.config import override, pick
     from kinetok.gpt.controller import Prior
     from kinetok.rl.ranks import joined

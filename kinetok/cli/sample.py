@@ -57,8 +57,8 @@ def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, 
     """
     from dataclasses import replace
 
-    from kinetok.adapters.finetune import Skill
     from kinetok.adapters.rlft import play
+    from kinetok.adapters.skill import Skill
     from kinetok.config import to_dict
     from kinetok.motion.clip import Clip
     from kinetok.render.video import render_task, write_video

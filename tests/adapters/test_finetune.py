@@ -13,8 +13,9 @@ from made import make_prior
 from kinetok.adapters import ADAPTERS, CoLAConfig, LoRAConfig
 from kinetok.adapters import finetune as room
 from kinetok.adapters.adapted import Adapted, fingerprint, parameters_of
-from kinetok.adapters.finetune import FinetuneConfig, Skill, finetune, mean_of, reshaped
+from kinetok.adapters.finetune import FinetuneConfig, finetune, reshaped
 from kinetok.adapters.rlft import TokenPolicyConfig, play
+from kinetok.adapters.skill import Skill
 from kinetok.checkpoint import ADAPTER, CheckpointError, load_artifact, load_state, save_artifact
 from kinetok.config import ConfigError, override
 from kinetok.evaluate import evaluate_task
@@ -196,19 +197,6 @@ def test_every_adapter_runs_and_every_task(models, tmp_path, kind, task):
     assert skill.adapted.cond_dim == width == Skill.from_pretrained(tmp_path).adapted.cond_dim
     played = play(skill.controller(0), skill.task, skill.prior, episodes=1, seconds=0.2, threads=1)
     assert np.isfinite(played.score.merit)
-
-
-def test_the_mean_of_checkpoints_by_hand(plain, models, tmp_path):
-    one, other = Skill.from_pretrained(plain), Skill.from_pretrained(plain)
-    state = {name: tensor + 1.0 for name, tensor in one.adapted.adapter_state().items()}
-    other.adapted.load_adapter_state_(state)
-    mean_of([one, other, other]).save_pretrained(tmp_path / "mean")
-    assert same(weights(plain), one.adapted.adapter_state())  # those it is made of are as they were
-    for name, tensor in weights(tmp_path / "mean").items():
-        torch.testing.assert_close(tensor, weights(plain)[name] + 2 / 3)
-    run(models, tmp_path / "cola", reshaped(replace(TINY, samples=64), task="target", adapter="cola"))
-    with pytest.raises(ConfigError, match=r"these adapters differ: kind: .*"):
-        mean_of([one, Skill.from_pretrained(tmp_path / "cola")])
 
 
 def test_another_adapter_keeps_what_it_has_in_common():
@@ -395,24 +383,6 @@ def test_a_reward_that_is_not_finite_stops_the_run_and_leaves_the_last_good_one(
     monkeypatch.undo()
     run(models, tmp_path)
     assert same(weights(tmp_path), weights(plain))
-
-
-def test_a_prior_that_has_moved_is_asked_for(plain, models, tmp_path):
-    there = tmp_path / "deep" / "skill"
-    there.parent.mkdir()
-    for path in plain.glob("*.*"):
-        there.mkdir(exist_ok=True)
-        (there / path.name).write_bytes(path.read_bytes()) if path.is_file() else None
-    with pytest.raises(CheckpointError, match=r"its prior is not at '.*prior'; give its place, --prior DIR"):
-        Skill.from_pretrained(there)
-    assert Skill.from_pretrained(there, models / "prior").task == TINY.task
-
-
-def test_an_adapter_without_a_task_cannot_be_played(models, tmp_path):
-    prior = Prior.from_pretrained(models / "prior")
-    Adapted(prior.gpt, LoRAConfig(rank=1), 2).save_pretrained(tmp_path, base="prior")
-    with pytest.raises(CheckpointError, match="says nothing of a task; it cannot be played"):
-        Skill.from_pretrained(tmp_path)
 
 
 @pytest.mark.parametrize(
