@@ -42,7 +42,7 @@ def together(task, out: Path, *given) -> list:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     torch.multiprocessing.spawn(_begin, (task, out, port, *given), nprocs=BOTH)
-    return [torch.load(out / f"{rank}.pt", weights_only=False) for rank in range(BOTH)]
+    return [torch.load(out / f"{rank}.pt", weights_only=True) for rank in range(BOTH)]
 
 
 def test_alone_nothing_is_changed():
