@@ -71,15 +71,23 @@ def evaluate_tracking(
         threads=threads,
         seed=seed,
     )
-    columns = score.success, score.success_mean_error, score.survival, score.mpjpe_mm, score.seconds
+    columns = {
+        "success": score.success,
+        "success_mean_error": score.success_mean_error,
+        "survival": score.survival,
+        "mpjpe_mm": score.mpjpe_mm,
+        "mpjpe_local_mm": score.mpjpe_local_mm,
+        "seconds": score.seconds,
+    }
     return {
         "success_rate": float(score.success.mean()),
         "success_rate_mean_error": float(score.success_mean_error.mean()),
         "survival_rate": float(score.survival.mean()),
         "mpjpe_mm": float(score.mpjpe_mm.mean()),
+        "mpjpe_local_mm": float(score.mpjpe_local_mm.mean()),
         "clips": [
-            {"name": name, "success": s, "success_mean_error": m, "survival": a, "mpjpe_mm": e, "seconds": t}
-            for name, s, m, a, e, t in zip(score.names, *(column.tolist() for column in columns), strict=True)
+            {"name": name} | {key: float(column[k]) for key, column in columns.items()}
+            for k, name in enumerate(score.names)
         ],
         "utilisation": None,
         "perplexity": None,

@@ -16,12 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 
-def mpjpe_mm(pos: ArrayLike, ref: ArrayLike) -> float:
+def mpjpe_mm(pos: ArrayLike, ref: ArrayLike, *, local: bool = False) -> float:
     """Mean per-joint position error in mm: 1000 * mean over t, b of |pos - ref|.
 
-    pos, ref: (T, B, 3) in metres. Global: root drift counts (GPC, table 1).
+    pos, ref: (T, B, 3) in metres. In the world's frame, so that the root's drift counts (GPC, table 1; the G-MPJPE of
+    Hybrid, table 2); `local` takes both from their root, the first body (there MPJPE).
     """
     pos, ref = _pair(pos, ref, "T B 3")
+    if local:
+        pos, ref = pos - pos[:, :1], ref - ref[:, :1]
     return float(1000.0 * np.linalg.norm(pos - ref, axis=-1).mean())
 
 

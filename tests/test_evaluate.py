@@ -117,7 +117,7 @@ def test_tracking_is_measured_the_same_at_any_thread_count(tmp_path, table):
     assert one == two
     assert {"success_rate", "success_rate_mean_error", "mpjpe_mm", "clips", "seed", "episodes"} <= one.keys()
     assert [clip["name"] for clip in one["clips"]] == ["cycle", "once"]
-    for key, column in (("success_rate", "success"), ("mpjpe_mm", "mpjpe_mm")):
+    for key, column in (("success_rate", "success"), ("mpjpe_mm", "mpjpe_mm"), ("mpjpe_local_mm", "mpjpe_local_mm")):
         assert one[key] == pytest.approx(np.mean([clip[column] for clip in one["clips"]]))
     assert len(one["utilisation"]) == len(one["perplexity"]) == 2
     assert min(one["utilisation"]) > 0 and max(one["perplexity"]) <= 125

@@ -14,6 +14,8 @@ def test_mpjpe_by_hand():
     pos = ZEROS.copy()
     pos[:, 0] = (0.3, 0.0, 0.4)  # one of two bodies is 0.5 m off: 250 mm on average
     assert metrics.mpjpe_mm(pos, ZEROS) == pytest.approx(250.0)
+    assert metrics.mpjpe_mm(pos + 1.0, pos, local=True) == pytest.approx(0.0, abs=1e-9)  # from the root, drift is none
+    assert metrics.mpjpe_mm(pos, ZEROS, local=True) == pytest.approx(250.0)  # the other body, as the root was moved
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from kinetok.rl.nets import Actor
 from kinetok.rl.rollout import torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.scene import SceneConfig
-from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig, lengths
 
 THRESHOLD = 0.5
 FALL = 0.4  # metres of the root's height from its reference's
@@ -30,13 +30,15 @@ START_NOISE = 0.01
 class TrackingScore:
     """Per clip (K,): success, the share of episodes whose largest body error stayed below 0.5 m; success_mean_error,
     the same of the mean body error; survival, the share that never fell, without pushes the same; mpjpe_mm over
-    all frames until a failure; seconds until it (mean form); limit: seconds that its episodes could last."""
+    all frames until a failure, in the world's frame (the G-MPJPE of some papers); mpjpe_local_mm, the same from the
+    root (their MPJPE); seconds until it (mean form); limit: seconds that its episodes could last."""
 
     names: tuple[str, ...]
     success: np.ndarray
     success_mean_error: np.ndarray
     survival: np.ndarray
     mpjpe_mm: np.ndarray
+    mpjpe_local_mm: np.ndarray
     seconds: np.ndarray
     limit: np.ndarray
     episodes: int
@@ -57,6 +59,7 @@ class TrackingScore:
             "success_mean_error": float(self.success_mean_error.mean()),
             "survival": float(self.survival.mean()),
             "mpjpe_mm": float(self.mpjpe_mm.mean()),
+            "mpjpe_local_mm": float(self.mpjpe_local_mm.mean()),
             "seconds": float(self.seconds.mean()),
         }
 
@@ -66,9 +69,10 @@ class TrackingScore:
 
     @staticmethod
     def from_json(data: dict) -> "TrackingScore":
-        """Scores from before limits were kept take the longest clip's seconds for every clip's, as they did then."""
-        longest = [max(data["seconds"])] * len(data["seconds"])
-        data = {"limit": longest, "survival": data["success_mean_error"]} | data
+        """Scores from before limits were kept take the longest clip's seconds for every clip's, as they did then; an
+        error from the root that was not kept is NaN."""
+        longest, unknown = ([value] * len(data["seconds"]) for value in (max(data["seconds"]), np.nan))
+        data = {"limit": longest, "survival": data["success_mean_error"], "mpjpe_local_mm": unknown} | data
         arrays = {key: np.array(value) for key, value in data.items() if key not in ("names", "episodes")}
         return TrackingScore(names=tuple(data["names"]), episodes=data["episodes"], **arrays)
 
@@ -109,16 +113,21 @@ def track(
     left = (table.last - table.first)[fixed] - starts
     limit = np.where(loops[fixed], np.minimum(round(seconds * table.control_hz), left), left)
     running, failed, fallen = np.ones(rows, bool), np.zeros(rows, bool), np.zeros(rows, bool)
-    largest, total, frames, steps = np.zeros(rows), np.zeros(rows), np.zeros(rows), 0
+    largest, total, local = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+    frames, steps = np.zeros(rows), 0
     obs = env.reset()
     with torch.no_grad(), torch_threads(1):
         while running.any():
             step = env.step(actor.act(torch.as_tensor(obs))[0].numpy(force=True))
             obs, steps = step.obs, steps + 1
             counts = running & ~failed
-            error = np.nan_to_num(task.error[counts], nan=np.inf, posinf=np.inf)
+            offset = task.offset[counts]
+            error, apart = (
+                np.nan_to_num(lengths(o), nan=np.inf, posinf=np.inf) for o in (offset, offset - offset[:, :1])
+            )
             largest[counts] = np.maximum(largest[counts], error.max(1))
             total[counts] += np.minimum(error.mean(1), 1.0)
+            local[counts] += np.minimum(apart.mean(1), 1.0)
             frames[counts] += 1
             failed[counts] = step.terminated[counts] | (error.mean(1) > THRESHOLD)
             height = np.abs(env.sim.qpos[:, 2] - task.reference.pos[:, 0, 2])
@@ -133,7 +142,8 @@ def track(
         success=per_clip(~failed & (largest < THRESHOLD)),
         success_mean_error=per_clip(~failed),
         survival=per_clip(~fallen),
-        mpjpe_mm=1000 * total.reshape(clips, episodes).sum(1) / frames.reshape(clips, episodes).sum(1),
+        mpjpe_mm=1000 * per_clip(total) / per_clip(frames),
+        mpjpe_local_mm=1000 * per_clip(local) / per_clip(frames),
         seconds=per_clip(frames) / table.control_hz,
         limit=per_clip(limit) / table.control_hz,
         episodes=episodes,

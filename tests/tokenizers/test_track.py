@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kinetok.motion.library import ClipLibrary
-from kinetok.sim.tasks.tracking import ReferenceTable
+from kinetok.sim.tasks.tracking import ReferenceTable, Tracking
 from kinetok.tokenizers.track import TrackingScore, track
 
 
@@ -28,7 +28,7 @@ def good(standing):
 def test_a_follower_of_a_standing_clip_succeeds(good):
     assert good.names == ("wave", "sweep") and good.episodes == 3
     assert (good.success == 1).all() and (good.success_mean_error == 1).all()
-    assert (good.mpjpe_mm < 100).all()
+    assert (good.mpjpe_mm < 100).all() and (good.mpjpe_local_mm > 0).all()
     assert good.seconds.tolist() == [1.0, 1.0]  # every episode of a clip that ends runs from its first frame
 
 
@@ -112,9 +112,9 @@ def test_the_limit_is_the_clips_end_or_the_seconds_of_a_loop(wave, good):
 
 def test_a_score_from_before_limits_keeps_its_merit(good):
     old = good.to_json() | {"seconds": [0.5, 2.0]}
-    del old["limit"], old["survival"]
+    del old["limit"], old["survival"], old["mpjpe_local_mm"]
     again = TrackingScore.from_json(old)
-    assert again.survival.tolist() == good.success_mean_error.tolist()
+    assert again.survival.tolist() == good.success_mean_error.tolist() and np.isnan(again.mpjpe_local_mm).all()
     expected = good.success.mean() + 0.2 * (0.25 + 1) / 2 - good.mpjpe_mm.mean() / 1000
     assert again.limit.tolist() == [2.0, 2.0] and again.merit == pytest.approx(expected)
 
@@ -122,6 +122,24 @@ def test_a_score_from_before_limits_keeps_its_merit(good):
 def test_json_round_trip_is_exact(good):
     again = TrackingScore.from_json(json.loads(json.dumps(good.to_json())))
     assert again.names == good.names and again.episodes == good.episodes
-    for name in ("success", "success_mean_error", "survival", "mpjpe_mm", "seconds", "limit"):
+    for name in ("success", "success_mean_error", "survival", "mpjpe_mm", "mpjpe_local_mm", "seconds", "limit"):
         assert np.array_equal(getattr(again, name), getattr(good, name))
     assert again.merit == good.merit
+
+
+def test_error_from_the_root_is_that_without_its_drift(standing, monkeypatch):
+    """Everything 0.3 m further along x than it was: the one error grows, the other stays."""
+    score = {}
+    for away in (0.0, 0.3):
+        real = Tracking.over
+
+        def over(self, body, away=away, real=real):
+            found = real(self, body)
+            self.offset = self.offset + np.array([away, 0, 0], np.float32)
+            return found
+
+        monkeypatch.setattr(Tracking, "over", over)
+        score[away] = track(Follow(standing.character.nu), standing, future=(1,), episodes=1)
+        monkeypatch.undo()
+    assert (score[0.3].mpjpe_mm - score[0.0].mpjpe_mm > 200).all()
+    np.testing.assert_allclose(score[0.3].mpjpe_local_mm, score[0.0].mpjpe_local_mm, rtol=1e-4)

@@ -38,7 +38,7 @@ class Graceful(Tracking):
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
         terminated, over = super().over(body)
-        terminated &= (self.grace == 0) | ~np.isfinite(self.error).all(1)
+        terminated &= (self.grace == 0) | ~np.isfinite(self.offset).all((1, 2))
         self.grace = np.maximum(self.grace - 1, 0)
         return terminated, over
 

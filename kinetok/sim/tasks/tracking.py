@@ -145,7 +145,7 @@ class Tracking:
         self.clip = np.zeros(rows, dtype=int)
         self.frame = np.zeros(rows, dtype=int)
         self.reference = table.body.rows(self.frame)  # where each row should be now
-        self.error = np.zeros((rows, len(self.character.body_names)), dtype=np.float32)
+        self.offset = np.zeros((rows, len(self.character.body_names), 3), dtype=np.float32)
         self._future = np.array(config.future)
         bodies = len(self.character.body_names)
         sizes = {
@@ -217,14 +217,13 @@ class Tracking:
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
         """terminated: the error is too large (or not a number); truncated: the clip is over.
 
-        `error` keeps every body's distance (N, B) in metres from the reference, as it was before any reset.
+        `offset` keeps where the reference was from every body (N, B, 3), in metres, before any reset.
         """
-        offset = self.reference.pos - body.pos
-        error = self.error = np.sqrt(np.einsum("nbi,nbi->nb", offset, offset))
+        offset = self.offset = self.reference.pos - body.pos
         if self.config.failure.slack:
-            near = offset.copy()
-            near[..., :2] -= _no_longer(offset[:, :1, :2], self.config.failure.slack)
-            error = np.sqrt(np.einsum("nbi,nbi->nb", near, near))
+            offset = offset.copy()
+            offset[..., :2] -= _no_longer(offset[:, :1, :2], self.config.failure.slack)
+        error = lengths(offset)
         fine = (error.max(1) < self.config.failure.largest) & (error.mean(1) < self.config.failure.mean)
         return ~fine, self.frame >= self.table.last[self.clip]
 
@@ -239,7 +238,11 @@ class Tracking:
         self.weights.update(self.clip[ids], ~terminated)
 
 
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """Of vectors (..., k)."""
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+
+
 def _no_longer(vectors: np.ndarray, length: float) -> np.ndarray:
     """Vectors (..., k) of at most that length."""
-    own = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
-    return vectors * np.minimum(1, length / own.clip(1e-6))
+    return vectors * np.minimum(1, length / lengths(vectors)[..., None].clip(1e-6))

@@ -7,7 +7,7 @@ import pytest
 
 from kinetok.config import ConfigError
 from kinetok.sim.batch import BodyState
-from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig, lengths
 
 RNG = np.random.default_rng(0)
 
@@ -147,7 +147,7 @@ def test_slack_forgives_where_the_root_is_and_nothing_else(table):
     body.pos[2, 3, 1] += 0.6
     body.pos[3, :, 2] += 0.6
     assert task.over(body)[0].tolist() == [False, True, True, True]
-    np.testing.assert_allclose(task.error[0], np.sqrt(2), atol=1e-5)  # what is reported is the whole error
+    np.testing.assert_allclose(lengths(task.offset[0]), np.sqrt(2), atol=1e-5)  # what is reported is the whole error
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_failure_by_mean_and_by_largest_error(table, bodies, distance, fails):
     body.pos[0, -bodies:, 1] += distance
     assert task.over(body)[0].tolist() == [fails]
     if np.isfinite(distance):
-        assert task.error[0].max() == pytest.approx(distance, abs=1e-5)
+        assert lengths(task.offset[0]).max() == pytest.approx(distance, abs=1e-5)
 
 
 def test_a_table_that_memory_cannot_hold_is_refused_before_it_is_filled(library, monkeypatch):
