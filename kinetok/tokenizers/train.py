@@ -47,7 +47,8 @@ class PPOStage:
     stop_success reached, the best score is so many evaluations old; critic_warmup: first iterations that leave the
     policy alone; log_std: spread of the actions at the first and the last iteration; anchor: pull towards the policy
     it started from; ema: factor of the average of the weights over updates, which is then what is judged and kept
-    (rl/average.py), 0 for the last ones themselves; failure: when training's episodes end; eval_push: evaluations
+    (rl/average.py), 0 for the last ones themselves; failure: when training's episodes end, leniency: its limits at the
+    first iteration, as a multiple of those, which they come down to evenly; eval_push: evaluations
     push the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
     clip, within `reach` metres of roaming.likeness, so that motions can go over into one another."""
 
@@ -64,6 +65,7 @@ class PPOStage:
     anchor: float = 0.0
     ema: float = 0.0
     failure: Failure = Failure()
+    leniency: float = 1.0
     eval_push: float = 0.0
     arrivals: float = 0.0
     reach: float = 0.4
@@ -76,6 +78,8 @@ class PPOStage:
         at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
         if not 0 <= self.ema < 1:
             raise ConfigError(f"ema must be at least 0 and below 1, not {self.ema}; 0 is none")
+        if not self.leniency >= 1:
+            raise ConfigError(f"leniency must be at least 1, not {self.leniency}; 1 is none")
         if not (0 <= self.arrivals <= 1 and self.reach > 0):
             raise ConfigError(f"arrivals is a share and reach above 0 m, not {self.arrivals} and {self.reach}")
 
@@ -132,8 +136,9 @@ def train_ppo(
         episodes, push = config.eval_episodes, config.eval_push
         return track(actor, table, future=future, scene=scene, episodes=episodes, push=push, threads=threads)
 
-    def spread(share: float) -> None:
+    def settle(share: float) -> None:
         policy.log_std = config.log_std[0] + share * (config.log_std[1] - config.log_std[0])
+        task.config = replace(tracking, failure=config.failure.times(1 + (1 - share) * (config.leniency - 1)))
 
     progress = run.train(
         samples=config.samples,
@@ -141,7 +146,7 @@ def train_ppo(
         evaluate=evaluate,
         keep=lambda score: actor.save_pretrained(out, card(score), parents),
         finished=lambda progress: good_enough(progress, config),
-        schedule=spread,
+        schedule=settle,
         critic_warmup=config.critic_warmup,
         warm=float(actor.norm.count) > 0,
         title=title,

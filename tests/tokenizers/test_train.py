@@ -13,7 +13,7 @@ from kinetok.motion.library import ClipLibrary
 from kinetok.rl import training
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.scene import SceneConfig
-from kinetok.sim.tasks.tracking import ReferenceTable
+from kinetok.sim.tasks.tracking import Failure, ReferenceTable
 from kinetok.tokenizers import train
 from kinetok.tokenizers.fit import new_tokenizer
 from kinetok.tokenizers.tokenizer import MotionTokenizer
@@ -26,7 +26,7 @@ def config(small) -> PPOStage:
     """Four iterations, the last three of which learn, and evaluations after the second and the fourth; everything
     that draws random numbers is on."""
     env = EnvConfig(reset_noise=0.02, push=0.5, friction=(0.8, 1.2), episode_seconds=0.5)
-    return replace(small.ppo, env=env, anchor=0.1)
+    return replace(small.ppo, env=env, anchor=0.1, leniency=1.5)
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,27 @@ def test_a_resumed_run_is_the_unbroken_one(half, whole, config, small, standing)
     assert untimed(half) == untimed(out)
     assert load_artifact(half).hash == load_artifact(out).hash
     assert same(fresh.state_dict(), MotionTokenizer.from_pretrained(out).state_dict())
+
+
+def test_leniency_ends_episodes_later_at_first(config, student, standing, tmp_path, monkeypatch):
+    limits, real = [], training.collect
+    monkeypatch.setattr(
+        training, "collect", lambda world, *a, **k: limits.append(world.task.config.failure) or real(world, *a, **k)
+    )
+    lenient = replace(config, failure=Failure(largest=0.6, mean=0.3, slack=0.1), leniency=2.0)
+    train_ppo(student, standing, lenient, tmp_path, quiet=True)
+    np.testing.assert_allclose([limit.largest for limit in limits], [1.2, 1.05, 0.9, 0.75])
+    np.testing.assert_allclose([limit.mean for limit in limits], [0.6, 0.525, 0.45, 0.375])
+    assert {limit.slack for limit in limits} == {0.1}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"leniency": 0.5}, "leniency must be at least 1, not 0.5"), ({"ema": 1.0}, "ema must be at least 0 and below 1")],
+)
+def test_a_stage_that_makes_no_sense_is_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        PPOStage(**settings)
 
 
 def test_threads_change_nothing(whole, config, student, standing, tmp_path):

@@ -47,6 +47,10 @@ class Failure:
         if not self.slack >= 0:
             raise ConfigError(f"slack is metres that the root may be away by, 0 for none; not {self.slack}")
 
+    def times(self, factor: float) -> "Failure":
+        """The same slack, and limits so many times as wide."""
+        return replace(self, largest=factor * self.largest, mean=factor * self.mean)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingConfig:
