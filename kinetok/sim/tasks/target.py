@@ -29,19 +29,24 @@ REST = 0.6  # of `near`: where it wants to come to rest
 
 @dataclass(frozen=True, kw_only=True)
 class TargetConfig:
-    """scale: alpha_pos per metre; near: eps_prox, metres within which the target is reached; seconds: range of
+    """scale: alpha_pos per metre; near: eps_prox, metres within which the target is reached; full: metres within which
+    the reward is full, eps_prox too in the paper: less of it draws the character further in; seconds: range of
     tau_reset, how long a target stays; distance: range in metres from the root to a new target, whose direction is
-    random; fall_height: metres of the root below which an episode fails (GPC table 11; distance, fall_height: ours)."""
+    random; fall_height: metres of the root below which an episode fails (GPC table 11; full apart from near, distance,
+    fall_height: ours)."""
 
     kind: Literal["target"] = "target"
     scale: float = 0.42
     near: float = 0.5
+    full: float = 0.5
     seconds: tuple[float, float] = (6.0, 8.0)
     distance: tuple[float, float] = (1.0, 5.0)
     fall_height: float = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(seconds=self.seconds, distance=self.distance)
+        if not self.full >= 0:
+            raise ConfigError(f"full is metres within which the reward is full, 0 for none; not {self.full}")
         if self.distance[1] <= self.near:
             raise ConfigError(f"distance {self.distance} lies within near {self.near} m: reached without a step")
 
@@ -103,9 +108,9 @@ class Target:
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Eq. 10: 1 within eps_prox, exp(-alpha_pos d) further away."""
+        """Eq. 10: 1 within eps_prox (`full`), exp(-alpha_pos d) further away."""
         distance = length(body.pos[:, 0, :2] - self.target)
-        reward = np.where(distance < self.config.near, 1.0, np.exp(-self.config.scale * distance))
+        reward = np.where(distance < self.config.full, 1.0, np.exp(-self.config.scale * distance))
         return reward, {"target": reward}
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:

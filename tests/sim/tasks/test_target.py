@@ -23,6 +23,17 @@ def test_reward_by_hand(humanoid):
     np.testing.assert_array_equal(terms["target"], reward)
 
 
+def test_reward_that_is_full_further_in(humanoid):
+    task = make(humanoid, 2, full=0.3)
+    task.target[:] = [[0.4, 0], [0.29, 0]]
+    body = body_at([[0, 0]] * 2)
+    np.testing.assert_allclose(task.reward(body)[0], [0.845354, 1.0], rtol=1e-5)  # exp(-.42 * .4) = exp(-.168)
+    task.over(body)
+    assert task.reached.all()  # what counts as reached stays
+    with pytest.raises(ConfigError, match=r"full is metres .* not -0.1"):
+        TargetConfig(full=-0.1)
+
+
 def test_the_target_as_the_character_sees_it(humanoid):
     task = make(humanoid, 2)
     task.target[:] = [[1, 3], [1, 3]]
