@@ -448,8 +448,8 @@ WRONG = {
     "same clip twice": (lambda p, c, r, t: (*FIT, c, "--clips", c), "two clips are named 'wave'; rename a file"),
     "preset": (
         lambda p, c, r, t: (*FIT, c, "--preset", "one-clp"),
-        "unknown preset 'one-clp'; one of: one-clip, many-clips, generalist, robust, experts, precise, from-scratch, "
-        "tiny; did you mean 'one-clip'?",
+        "unknown preset 'one-clp'; one of: one-clip, many-clips, generalist, robust, experts, from-scratch, tiny; "
+        "did you mean 'one-clip'?",
     ),
     "setting": (
         lambda p, c, r, t: (*FIT, c, "--set", "teacher.sample=5"),

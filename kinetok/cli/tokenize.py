@@ -32,8 +32,8 @@ def tokenize_fit(paths, hours, out, stages, preset, settings, threads, seed) -> 
     \b
     Presets: one-clip (minutes), many-clips (hours), generalist (one teacher
     for many), robust (a teacher that withstands pushes, from another one),
-    experts (one for each clip, from the packaged teacher),
-    precise (the same, from experts: --set teacher_start=runs/hard/teachers),
+    experts (one for each clip, from the packaged teacher, or from others:
+    --set teacher_start=runs/hard/teachers),
     from-scratch (end-to-end PPO alone), tiny (tests).
     Examples: kinetok tokenize fit --clips walk.txt --out runs/walk --set teacher.samples=1500000
     kinetok tokenize fit --clips walk.txt --out runs/robust --preset robust --set start=humanoid-teacher
