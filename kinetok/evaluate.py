@@ -71,14 +71,7 @@ def evaluate_tracking(
         threads=threads,
         seed=seed,
     )
-    columns = {
-        "success": score.success,
-        "success_mean_error": score.success_mean_error,
-        "survival": score.survival,
-        "mpjpe_mm": score.mpjpe_mm,
-        "mpjpe_local_mm": score.mpjpe_local_mm,
-        "seconds": score.seconds,
-    }
+    columns = ("success", "success_mean_error", "survival", "mpjpe_mm", "mpjpe_local_mm", "seconds")
     return {
         "success_rate": float(score.success.mean()),
         "success_rate_mean_error": float(score.success_mean_error.mean()),
@@ -86,7 +79,7 @@ def evaluate_tracking(
         "mpjpe_mm": float(score.mpjpe_mm.mean()),
         "mpjpe_local_mm": float(score.mpjpe_local_mm.mean()),
         "clips": [
-            {"name": name} | {key: float(column[k]) for key, column in columns.items()}
+            {"name": name} | {column: float(getattr(score, column)[k]) for column in columns}
             for k, name in enumerate(score.names)
         ],
         "utilisation": None,

@@ -93,8 +93,7 @@ def robust() -> FitConfig:
 
 
 def experts() -> FitConfig:
-    """An expert for each motion, leaps and flips among them, that begins as the packaged teacher, or with
-    `teacher_start` as those in a folder.
+    """An expert for each motion, that begins as the packaged teacher, or with `teacher_start` as those in a folder.
 
     Much noise and little at the end, for a step is bounded in units of it; a kernel on the bodies' places that still
     pays at 50 mm; and episodes that go on at first with a body a metre from its place, for who is stopped there never
