@@ -108,7 +108,8 @@ class Training:
         keep: writes the artifact, called with each score that is the best so far. schedule: told the share done
         before each rollout. save_every: samples from a save to the evaluation that is followed by the next, 0 for every
         one; after a save the worlds begin anew, so not too often. critic_warmup: first iterations that leave the policy
-        alone. warm: the policy's normalisers come from an earlier training, and the first rollout does not reset them.
+        alone. warm: the policy's normalisers come from an earlier training and stay as they are: moved, they undo what
+        its weights, which know no others, can do (docs/log.md, "What a normaliser forgets").
         """
         progress = self.resume()
         per_iteration = self.world.rows * self.config.horizon * ranks.size()
@@ -127,7 +128,7 @@ class Training:
                 with self._stopping(rollout):
                     train_actor = progress.iteration > critic_warmup
                     metrics = {} if first else self.learn(rollout, done, train_actor=train_actor)
-                    if not (first and warm):
+                    if not warm:
                         self.policy.observe(rollout.obs)
                     self.critic.observe(rollout.obs)
                 if self.average and train_actor:

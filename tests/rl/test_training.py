@@ -173,12 +173,12 @@ def test_a_finished_run_does_nothing(tmp_path):
     assert not again.kept and vars(progress) == before["progress"]
 
 
-def test_the_first_rollout_sets_the_normalisers_of_a_fresh_policy_only(tmp_path):
-    fresh, warm = Run(tmp_path / "a", stage=Stage(samples=64)), Run(tmp_path / "b", stage=Stage(samples=64))
+def test_rollouts_move_the_normalisers_of_a_fresh_policy_only(tmp_path):
+    fresh, warm = Run(tmp_path / "a", stage=Stage(samples=192)), Run(tmp_path / "b", stage=Stage(samples=192))
     fresh.train()
     warm.train(warm=True)
-    assert float(fresh.actor.norm.count) == 64 and float(warm.actor.norm.count) == 0
-    assert float(warm.training.critic.norm.count) == 64
+    assert float(fresh.actor.norm.count) == 192 and float(warm.actor.norm.count) == 0
+    assert float(warm.training.critic.norm.count) == 192
 
 
 @pytest.mark.parametrize(("bad", "message"), [(np.nan, "2 of 64 rewards are not finite"), (np.inf, "2 of 64 rewards")])
