@@ -37,9 +37,10 @@ class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; noise: radians added to the student's targets while it acts; failure: when its
     episodes end; focus: how many times as many states the clip that fails most may have as the one that fails least;
-    save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
-    often); transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's
-    teacher; reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends.
+    from_start: share of the episodes that begin at their clip's first frame; transitions: changes of clip per second
+    while it learns (sim.tasks.roaming), labelled by the new clip's teacher; reach_at_end: metres of roaming.likeness
+    within which a motion goes on in another clip where its own ends; save_every: samples between states to resume
+    from, at the next evaluation (the memory starts anew there, so not too often).
 
     A clip that its own teacher cannot follow fails for ever, and takes its share for nothing: of K clips, one such
     leaves (K - 1) / (K - 1 + focus) of the states to the others: of 20 clips 5/6 with a focus of 4."""
@@ -54,6 +55,7 @@ class DistillStage:
     noise: float = 0.02
     failure: Failure = Failure()
     focus: float = 4.0
+    from_start: float = 0.0
     transitions: float = 0.0
     reach_at_end: float = REACH
     eval_every: int = 50_000
@@ -97,7 +99,7 @@ def distill(
         raise ValueError(f"{len(table.names)} clips need a teacher each (the same one may repeat), not {len(teachers)}")
     future, scene = student.config.future, student.config.scene
     seen_by_any = {frame for one in (student, *teachers) for frame in one.config.future}
-    tracking = TrackingConfig(future=tuple(sorted(seen_by_any)), failure=config.failure)
+    tracking = TrackingConfig(future=tuple(sorted(seen_by_any)), failure=config.failure, from_start=config.from_start)
     task = Tracking(tracking, table, rows=config.rows)
     if config.transitions:
         rng, rate = np.random.default_rng([seed, 1]), config.transitions

@@ -50,7 +50,8 @@ class PPOStage:
     (rl/average.py), 0 for the last ones themselves; failure: when training's episodes end, leniency: its limits at the
     first iteration, as a multiple of those, which they come down to evenly; eval_push: evaluations
     push the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
-    clip, within `reach` metres of roaming.likeness, so that motions can go over into one another."""
+    clip, within `reach` metres of roaming.likeness, so that motions can go over into one another; from_start: share of
+    the episodes that begin at their clip's first frame, in the place of anywhere in it."""
 
     samples: int = 2_000_000
     rows: int = 512
@@ -69,6 +70,7 @@ class PPOStage:
     eval_push: float = 0.0
     arrivals: float = 0.0
     reach: float = 0.4
+    from_start: float = 0.0
     reward: TrackingReward = TrackingReward()
     env: EnvConfig = EnvConfig()
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -106,7 +108,7 @@ def train_ppo(
     identity = identify(config, actor.config, table.names, seed) | ({"parents": parents} if parents else {})
     refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
-    tracking = TrackingConfig(future=future, failure=config.failure, reward=config.reward)
+    tracking = TrackingConfig(future=future, failure=config.failure, reward=config.reward, from_start=config.from_start)
     rows, threads = ranks.share(config.rows, "rows"), ranks.threads(threads)
     task = Tracking(tracking, table, rows=rows)
     if config.arrivals:

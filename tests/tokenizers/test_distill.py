@@ -139,6 +139,18 @@ def test_every_clip_is_labelled_by_its_own_teacher(student, teachers, standing, 
     assert same(weights[0], weights[2]) and not same(weights[0], weights[1])
 
 
+def test_all_its_episodes_may_begin_at_first_frames(student, teachers, standing, config, tmp_path, monkeypatch):
+    def reset(env, **how):
+        obs = real(env, **how)
+        begun.append(env.task.frame - standing.first[env.task.clip])
+        return obs
+
+    begun, real = [], Env.reset
+    monkeypatch.setattr(Env, "reset", reset)
+    distill(student, teachers, standing, replace(config, samples=20 * 32, from_start=1.0), tmp_path, quiet=True)
+    assert len(begun[0]) == 32 and not begun[0].any()
+
+
 def test_a_changed_teacher_is_refused(config, student, teachers, standing, tmp_path, cut_off):
     def run(left, right):
         parents = {"teacher/wave": left * 64, "teacher/sweep": right * 64}

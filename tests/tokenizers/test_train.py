@@ -93,15 +93,16 @@ def test_a_resumed_run_is_the_unbroken_one(half, whole, config, small, standing)
 
 
 def test_leniency_ends_episodes_later_at_first(config, student, standing, tmp_path, monkeypatch):
-    limits, real = [], training.collect
+    settings, real = [], training.collect
     monkeypatch.setattr(
-        training, "collect", lambda world, *a, **k: limits.append(world.task.config.failure) or real(world, *a, **k)
+        training, "collect", lambda world, *a, **k: settings.append(world.task.config) or real(world, *a, **k)
     )
-    lenient = replace(config, failure=Failure(largest=0.6, mean=0.3, slack=0.1), leniency=2.0)
+    lenient = replace(config, failure=Failure(largest=0.6, mean=0.3, slack=0.1), leniency=2.0, from_start=0.2)
     train_ppo(student, standing, lenient, tmp_path, quiet=True)
+    limits = [setting.failure for setting in settings]
     np.testing.assert_allclose([limit.largest for limit in limits], [1.2, 1.05, 0.9, 0.75])
     np.testing.assert_allclose([limit.mean for limit in limits], [0.6, 0.525, 0.45, 0.375])
-    assert {limit.slack for limit in limits} == {0.1}
+    assert {limit.slack for limit in limits} == {0.1} and {setting.from_start for setting in settings} == {0.2}
 
 
 @pytest.mark.parametrize(

@@ -56,12 +56,18 @@ class Failure:
 class TrackingConfig:
     """future: reference frames seen, in control steps ahead (GPC: 1, 2, 5, 7, 12, 18, 25); leash: metres from the root
     at which a reference that is further away is shown (ours): a push or a lag then looks like none a tracker has not
-    met; failure; reward."""
+    met; failure; reward; from_start: share of the episodes that begin at their clip's first frame, as encoding does:
+    a clip may begin where it is hardest to."""
 
     future: tuple[int, ...] = (1, 2, 5, 7, 12, 18, 25)
     leash: float = 0.3
     failure: Failure = Failure()
     reward: TrackingReward = TrackingReward()
+    from_start: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.from_start <= 1:
+            raise ConfigError(f"from_start is a share of the episodes, 0 to 1, not {self.from_start}")
 
 
 class ReferenceTable:
@@ -173,6 +179,8 @@ class Tracking:
             offset = self.starts[ids]
         else:
             offset = (rng.random(len(ids)) * table.cycle[clip]).astype(int)
+            if self.config.from_start:
+                offset[rng.random(len(ids)) < self.config.from_start] = 0
         self.place(ids, clip, table.first[clip] + offset)
         return table.qpos[self.frame[ids]], table.qvel[self.frame[ids]]
 

@@ -115,6 +115,19 @@ def test_starts_are_uniform_over_the_cycle(table):
         assert len(counts) == cycle and counts.min() > 0.5 * counts.mean()
 
 
+def test_a_share_of_the_episodes_starts_at_the_first_frame(table):
+    task = Tracking(TrackingConfig(from_start=0.5), table, rows=6000)
+    task.start(np.arange(6000), np.random.default_rng(0))
+    for clip, cycle in enumerate(table.cycle):
+        first = task.frame[task.clip == clip] == table.first[clip]
+        assert first.mean() == pytest.approx(0.5 + 0.5 / cycle, abs=0.03)
+
+
+def test_a_share_of_more_than_all_is_refused():
+    with pytest.raises(ConfigError, match="from_start is a share of the episodes, 0 to 1"):
+        TrackingConfig(from_start=1.5)
+
+
 def test_clips_that_fail_are_drawn_more_often(table):
     task = make(table, 4000)
     task.clip[:] = 1
