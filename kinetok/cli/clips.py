@@ -6,7 +6,18 @@ from typing import Any
 
 import click
 
-from kinetok.cli.shared import EXPORTS, PATHS, Chain, check_suffix, each_clip, one_clip, option_seed, say, write_motion
+from kinetok.cli.shared import (
+    EXPORTS,
+    PATHS,
+    VIDEOS,
+    Chain,
+    check_suffix,
+    each_clip,
+    one_clip,
+    option_seed,
+    say,
+    write_motion,
+)
 
 UNITS = ["m", "cm", "mm", "in", "cmu"]  # motion/formats/conventions.py
 
@@ -303,7 +314,7 @@ def clips_export(source: Path, out: Path, name: str | None) -> None:
 
 @clips.command("play")
 @click.argument("source", type=PATHS)
-@click.option("--out", required=True, type=PATHS, help="Video to write, ending in .mp4.")
+@click.option("--out", required=True, type=PATHS, help="Video to write, ending in .mp4 or .gif.")
 @click.option("--name", default=None, help="Which clip of a library; default its only one.")
 @click.option("--seconds", type=float, default=None, help="How much of it; default all, a loop three times.")
 def clips_play(source: Path, out: Path, name: str | None, seconds: float | None) -> None:
@@ -312,7 +323,7 @@ def clips_play(source: Path, out: Path, name: str | None, seconds: float | None)
 
     import numpy as np
 
-    check_suffix(out, ".mp4")
+    check_suffix(out, *VIDEOS)
     clip = one_clip(source, name)
     seconds = seconds or clip.seconds * (3 if clip.loop else 1)
     qpos = clip.at(np.arange(0, seconds, 1 / 30))

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import click
 
-from kinetok.cli.shared import PATHS, check_suffix, option_device, option_seed, show_json, write_motion
+from kinetok.cli.shared import PATHS, VIDEOS, check_suffix, option_device, option_seed, show_json, write_motion
 
 
 @click.command()
 @click.option("--prior", default=None, type=PATHS, help="Directory or packaged name.  [default: humanoid-gpt]")
 @click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill to play instead of the prior alone.")
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
-@click.option("--out", required=True, type=PATHS, help="Video to write; the motion and metrics go beside it.")
+@click.option("--out", required=True, type=PATHS, help="Video to write (.mp4, .gif); motion and metrics go beside it.")
 @click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
 @click.option(
     "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: 0.9, or the skill's own]"
@@ -22,12 +22,12 @@ from kinetok.cli.shared import PATHS, check_suffix, option_device, option_seed, 
 @option_seed
 @option_device
 def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
-    """New motion from the prior, simulated: OUT.mp4, OUT.safetensors (the clips) and OUT.json (metrics).
+    """New motion from the prior, simulated: a video, OUT.safetensors (the clips) and OUT.json (metrics).
 
     With --adapter the character does its task, and the video shows what is asked of it; the nucleus and the
     temperature are those it was trained with, unless you say otherwise.
     """
-    check_suffix(out, ".mp4")
+    check_suffix(out, *VIDEOS)
     drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
     if adapter is not None:
         return sample_skill(adapter, prior, tokenizer, out, drawn, seconds=seconds, count=count, push=push, seed=seed)

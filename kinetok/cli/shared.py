@@ -140,6 +140,7 @@ def show_json(data: dict, out: Path | None) -> None:
 
 
 PATHS = click.Path(path_type=Path)
+VIDEOS = (".mp4", ".gif")
 EXPORTS = (".bvh", ".csv", ".npz")  # of programs other than this one
 TASK_NAMES = "target|steering|path"
 
@@ -171,14 +172,14 @@ def write_motion(out: Path, *clips, caption: str = "") -> None:
     from kinetok.motion.formats.robot_csv import write_robot_csv
     from kinetok.motion.library import ClipLibrary
 
-    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
+    check_suffix(out, ".safetensors", *VIDEOS, *EXPORTS)
     clip, *others = clips
     character = Character.load(clip.character)
     if out.suffix == ".safetensors":
         ClipLibrary.write(out, clips)
     elif others:
         raise ValueError(f"--out {out}: {len(clips)} clips; of the files written here only .safetensors holds many")
-    elif out.suffix == ".mp4":
+    elif out.suffix in VIDEOS:
         from kinetok.render.video import render_frames, write_video
 
         out.parent.mkdir(parents=True, exist_ok=True)

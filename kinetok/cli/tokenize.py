@@ -5,6 +5,7 @@ import click
 from kinetok.cli.shared import (
     EXPORTS,
     PATHS,
+    VIDEOS,
     Chain,
     check_suffix,
     configured,
@@ -72,14 +73,14 @@ def tokenize_encode(clip, tokenizer, out, name, seconds) -> None:
 @tokenize.command("decode")
 @click.argument("tokens", type=PATHS)
 @click.option("--tokenizer", required=True, type=PATHS, help="The tokenizer that wrote the tokens.")
-@click.option("--out", required=True, type=PATHS, help=".safetensors (clip library), .mp4, .bvh, .csv or .npz.")
+@click.option("--out", required=True, type=PATHS, help=".safetensors (clip library), .mp4, .gif, .bvh, .csv or .npz.")
 def tokenize_decode(tokens, tokenizer, out) -> None:
     """Play tokens in simulation from their first state; no reference is involved."""
     from kinetok.motion.clip import Clip
     from kinetok.tokenizers.codec import TokenStream, decode_tokens
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
-    check_suffix(out, ".safetensors", ".mp4", *EXPORTS)
+    check_suffix(out, ".safetensors", *VIDEOS, *EXPORTS)
     stream = TokenStream.load(tokens)
     model = MotionTokenizer.from_pretrained(tokenizer)
     qpos, character = decode_tokens(model, stream), model.config.character

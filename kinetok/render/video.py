@@ -2,7 +2,7 @@
 
     frames = render_frames(humanoid, qpos, fps=30, ghost=reference, caption="walk")
     frames = render_frames(humanoid, qpos, fps=30, markers=markers, distance=6.0, elevation=-25.0)
-    write_video(Path("walk.mp4"), frames, fps=30)
+    write_video(Path("walk.mp4"), frames, fps=30)              # or walk.gif, for a web page
     write_strip(Path("walk.png"), humanoid, qpos)
 
 The camera follows the root, smoothed, from three quarters in front. `ghost` is a second sequence of poses drawn
@@ -33,6 +33,11 @@ DISTANCE, ELEVATION, THREE_QUARTERS = 3.1, -14.0, 138.0  # metres, degrees, degr
 BONE, BONE_COLOUR, BONE_GROUP = 0.028, (0.30, 0.34, 0.42, 1.0), 2  # radius in metres
 SHADE_HEIGHT = 0.9
 FOLLOW_SECONDS = 0.5
+PALETTE = "split[a][b];[a]palettegen=max_colors=48[p];[b][p]paletteuse=dither=none"  # one for all frames
+ENCODERS = {
+    ".mp4": "-c:v libx264 -preset veryfast -crf 21 -pix_fmt yuv420p -movflags +faststart",
+    ".gif": f"-vf fps=15,scale='min(400,iw)':-1:flags=area,{PALETTE}",
+}
 
 
 class RenderError(RuntimeError):
@@ -66,22 +71,26 @@ def render_frames(
 
 
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Encode images (H, W, 3) uint8 as H.264 (yuv420p, so sides must be even); the file appears whole or not at all."""
+    """Encode images (H, W, 3) uint8 by the file's suffix; the file appears whole or not at all.
+
+    .mp4: H.264 (yuv420p, so sides must be even); .gif: 15 frames a second, at most 400 columns, 48 colours.
+    """
     path = Path(path)
+    if path.suffix not in ENCODERS:
+        raise ValueError(f"{path}: a video's name ends in {' or '.join(ENCODERS)}")
     frames = iter(frames)
     try:
         first = next(frames)
     except StopIteration:
         raise ValueError(f"{path}: no frames; a video needs at least one") from None
     height, width = first.shape[:2]
-    if height % 2 or width % 2:
+    if path.suffix == ".mp4" and (height % 2 or width % 2):
         raise ValueError(f"{path}: frames are {width} x {height}; H.264 needs even sides")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.mp4")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{path.suffix}")
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6f}", "-i", "-"]
-    command += ["-an", "-c:v", "libx264", "-preset", "veryfast", "-crf", "21", "-pix_fmt", "yuv420p"]
-    command += ["-movflags", "+faststart", str(temporary)]
+    command += ["-an", *ENCODERS[path.suffix].split(" "), str(temporary)]
     try:
         _pipe(command, first, frames)
         os.replace(temporary, path)

@@ -8,6 +8,7 @@ import sys
 import imageio_ffmpeg
 import matplotlib.image
 import numpy as np
+import PIL.Image
 import pytest
 
 from kinetok.render import RenderError, render_frames, write_strip, write_video
@@ -108,6 +109,17 @@ def test_video_decodes_to_what_was_written(tmp_path, frames):
     assert [p.name for p in path.parent.iterdir()] == ["clip.mp4"]
 
 
+def test_a_gif_has_fifteen_frames_a_second(tmp_path, frames):
+    path = tmp_path / "clip.gif"
+    write_video(path, frames, 30)
+    with PIL.Image.open(path) as image:
+        assert (image.format, image.size, image.n_frames) == ("GIF", SIZE, 5)
+        image.seek(4)
+        drawn = np.asarray(image.convert("RGB")).astype(int)
+    assert np.abs(drawn - frames[8]).mean() < 8
+    assert [p.name for p in tmp_path.iterdir()] == ["clip.gif"]
+
+
 def test_strip(egl, tmp_path, humanoid, qpos):
     path = tmp_path / "clip.png"
     write_strip(path, humanoid, qpos, columns=3, rows=2, size=(40, 60))
@@ -133,6 +145,11 @@ def test_messages(tmp_path, humanoid, qpos):
         write_video(tmp_path / "a.mp4", [np.zeros((4, 5, 3), np.uint8)], 30)
 
 
+def test_a_video_has_a_suffix_that_can_be_written(tmp_path, frames):
+    with pytest.raises(ValueError, match=r"a\.avi: a video's name ends in \.mp4 or \.gif"):
+        write_video(tmp_path / "a.avi", frames, 30)
+
+
 def test_an_encoder_error_is_shown_and_leaves_no_file(tmp_path):
     with pytest.raises(RenderError, match="ffmpeg ended with code"):
         write_video(tmp_path / "a.mp4", [np.zeros((4, 4, 3), np.uint8)], 0.0)
@@ -148,6 +165,7 @@ def init(self, name, *args, **kwargs):
     load(self, name, *args, **kwargs)
 ctypes.CDLL.__init__ = init
 import numpy as np
+import PIL.Image
 from kinetok.motion.character import Character
 from kinetok.render import render_frames
 body = Character.load("humanoid")
