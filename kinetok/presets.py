@@ -17,6 +17,7 @@ from kinetok.gpt.refine import RefineConfig
 from kinetok.rl.ppo import PPOConfig
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.reward import TrackingReward
+from kinetok.sim.tasks.target import TargetConfig
 from kinetok.sim.tasks.tracking import Failure
 from kinetok.tokenizers.distill import DistillStage
 from kinetok.tokenizers.fit import FitConfig
@@ -205,13 +206,15 @@ def laptop_skill() -> FinetuneConfig:
     """Demonstrations in seven minutes, then reward in seventy, of which the critic has the first four to itself; after
     forty it does most of what it will: docs/tutorial.md."""
     return FinetuneConfig(
+        task=TargetConfig(full=0.3),  # where a reward is flat nothing keeps a body from drifting out (docs/skills.md)
         adapter=CoLAConfig(rank=32, alpha=64.0),
         hindsight=HindsightConfig(rounds=2, iterations=600, samples=400_000, memory=6, restless=(0.4, 6.0)),
         policy=TokenPolicyConfig(top_p=0.97, least=8, temperature=0.8),
         samples=3_932_160,
         eval_every=196_608,
-        eval_episodes=128,
-        critic_warmup=30,
+        eval_episodes=96,
+        critic_warmup=15,
+        ema=0.99,
         ppo=replace(FinetuneConfig().ppo, target_kl=0.01, lr_max=1e-3, critic_lr=2e-3, lam=0.97),
     )
 

@@ -510,7 +510,10 @@ def test_a_mistake_is_one_line_and_writes_nothing(args, message, tmp_path, clip,
     [
         (("clips", "import", "CLIP"), ".safetensors"),
         (("tokenize", "encode", "CLIP", "--tokenizer", "RUN"), ".safetensors"),
-        (("tokenize", "decode", "TOKENS", "--tokenizer", "RUN"), ".safetensors or .mp4 or .gif or .bvh or .csv or .npz"),
+        (
+            ("tokenize", "decode", "TOKENS", "--tokenizer", "RUN"),
+            ".safetensors or .mp4 or .gif or .bvh or .csv or .npz",
+        ),
         (("sample",), ".mp4 or .gif"),
     ],
 )

@@ -17,8 +17,9 @@ from torch import Tensor, nn
 
 
 class Average:
-    """factor: how much of the average an update leaves, between 0 and 1; fewer at the beginning, (1 + n) / (10 + n) of
-    the n-th at most. A part that a run saves and restores (resume.Part)."""
+    """factor: how much of the average an update leaves, between 0 and 1; by the n-th (1 + n) / (4 + n) at most, which
+    is the mean of all so far weighted by the square of their number. A part that a run saves and restores
+    (resume.Part)."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], factor: float):
         self.parameters, self.factor, self.count = list(parameters), factor, 0
@@ -28,7 +29,7 @@ class Average:
     def follow(self) -> None:
         """Take in what the parameters are now."""
         self.count += 1
-        share = 1 - min(self.factor, (1 + self.count) / (10 + self.count))
+        share = 1 - min(self.factor, (1 + self.count) / (4 + self.count))
         for mean, parameter in zip(self.means, self.parameters, strict=True):
             mean.lerp_(parameter, share)
 

@@ -14,7 +14,7 @@ def test_the_average_of_three_updates_by_hand():
     for count, value in enumerate([1.0, 5.0, -2.0], 1):
         weight.data.fill_(value)
         average.follow()
-        share = 1 - min(0.9, (1 + count) / (10 + count))
+        share = 1 - min(0.9, (1 + count) / (4 + count))
         mean = (1 - share) * mean + share * value
     with average.standing_in():
         assert weight.item() == pytest.approx(mean)
