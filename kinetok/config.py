@@ -96,6 +96,14 @@ def at_least(config: Any, least: float, remedies: Mapping[str, str]) -> None:
             raise ConfigError(f"{key} must be at least {least}, not {value}; {remedy}")
 
 
+def below(config: Any, limit: float, remedies: Mapping[str, str]) -> None:
+    """The same for a value that is not below `limit`."""
+    for key, remedy in remedies.items():
+        value = getattr(config, key)
+        if not value < limit:
+            raise ConfigError(f"{key} must be below {limit}, not {value}; {remedy}")
+
+
 def diff(a: Any, b: Any) -> list[str]:
     """Lines "key: old -> new" for every leaf in which two configs (or their dicts) differ."""
     old, new = (_leaves(side if isinstance(side, Mapping) else to_dict(side), "") for side in (a, b))

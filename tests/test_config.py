@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from kinetok.config import ConfigError, at_least, diff, from_dict, nearest, override, pick, to_dict
+from kinetok.config import ConfigError, at_least, below, diff, from_dict, nearest, override, pick, to_dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,12 +172,15 @@ def test_a_kind_counts_before_its_settings_and_the_same_kind_changes_nothing():
         override(ROOT, ["quantizer.levels=5", "quantizer.kind=vq"])
 
 
-def test_at_least_names_key_value_and_remedy():
+def test_limits_name_key_value_and_remedy():
     at_least(PPO(epochs=1), 1, {"epochs": "one is enough"})
     with pytest.raises(ConfigError, match="epochs must be at least 1, not 0; one is enough"):
         at_least(PPO(epochs=0), 1, {"epochs": "one is enough"})
     with pytest.raises(ConfigError, match=r"clip must be at least 0\.1, not nan; more"):
         at_least(PPO(clip=float("nan")), 0.1, {"epochs": "more", "clip": "more"})
+    below(PPO(epochs=1), 2, {"epochs": "one is enough"})
+    with pytest.raises(ConfigError, match="epochs must be below 2, not 2; one is enough"):
+        below(PPO(epochs=2), 2, {"epochs": "one is enough"})
 
 
 @pytest.mark.parametrize(

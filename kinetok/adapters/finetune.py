@@ -28,13 +28,13 @@ from kinetok.adapters.rlft import TaskScore, TokenPolicy, TokenPolicyConfig, pla
 from kinetok.adapters.sft import SFTConfig, supervise
 from kinetok.adapters.skill import Skill, skill_card
 from kinetok.checkpoint import ADAPTER, load_artifact, locate, refuse_foreign
-from kinetok.config import ConfigError, diff, nearest, pick, to_dict
+from kinetok.config import ConfigError, at_least, below, diff, nearest, pick, to_dict
 from kinetok.gpt.controller import Prior
 from kinetok.gpt.pretrain import THREADS
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl import ranks
-from kinetok.rl.average import Average
+from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import seeded, torch_threads
@@ -91,10 +91,8 @@ class FinetuneConfig:
         for name in ("samples", "rows", "eval_every", "eval_episodes", "save_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not self.anchor >= 0:
-            raise ConfigError(f"anchor must be at least 0, not {self.anchor}; 0 is none")
-        if not 0 <= self.ema < 1:
-            raise ConfigError(f"ema must be at least 0 and below 1, not {self.ema}; 0 is none")
+        at_least(self, 0, {"anchor": "0 is none", "ema": "0 is none"})
+        below(self, 1, AVERAGED)
         if self.eval_seconds < 0.1:
             raise ConfigError(f"eval_seconds must be at least 0.1, not {self.eval_seconds}")
 

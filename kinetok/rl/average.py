@@ -15,6 +15,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+AVERAGED = {"ema": "at 1 the average would never move"}  # config.below
+
 
 class Average:
     """factor: how much of the average an update leaves, between 0 and 1; by the n-th (1 + n) / (4 + n) at most, which

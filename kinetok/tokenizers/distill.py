@@ -10,6 +10,7 @@ episodes that end early keep the states as varied as the teachers can handle.
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kinetok.config import at_least
+from kinetok.config import at_least, below
 from kinetok.logger import Logger
 from kinetok.resume import State
 from kinetok.rl import ranks
+from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.rollout import seeded, torch_threads
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
@@ -35,12 +37,14 @@ from kinetok.tokenizers.train import COUNTS, KINDS, identify, in_scene, refuse_o
 @dataclass(frozen=True, kw_only=True)
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
-    memory: labelled states kept; noise: radians added to the student's targets while it acts; failure: when its
-    episodes end; focus: how many times as many states the clip that fails most may have as the one that fails least;
-    from_start: share of the episodes that begin at their clip's first frame; transitions: changes of clip per second
-    while it learns (sim.tasks.roaming), labelled by the new clip's teacher; reach_at_end: metres of roaming.likeness
-    within which a motion goes on in another clip where its own ends; save_every: samples between states to resume
-    from, at the next evaluation (the memory starts anew there, so not too often).
+    memory: labelled states kept; ema: factor of the average of the student's weights over control steps, which is then
+    what is judged and kept (rl/average.py), 0 for the last ones themselves; noise: radians added to the student's
+    targets while it acts; failure: when its episodes end; focus: how many times as many states the clip that fails most
+    may have as the one that fails least; from_start: share of the episodes that begin at their clip's first frame;
+    transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
+    reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends;
+    save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
+    often).
 
     A clip that its own teacher cannot follow fails for ever, and takes its share for nothing: of K clips, one such
     leaves (K - 1) / (K - 1 + focus) of the states to the others: of 20 clips 5/6 with a focus of 4."""
@@ -52,6 +56,7 @@ class DistillStage:
     memory: int = 131_072
     lr: float = 1e-3
     lr_end: float = 1e-4
+    ema: float = 0.0
     noise: float = 0.02
     failure: Failure = Failure()
     focus: float = 4.0
@@ -72,7 +77,8 @@ class DistillStage:
             "save_every": "give as many as samples for a single state at the end",
         })  # fmt: skip
         at_least(self, self.rows, {"memory": "every step's states go there, one of each of the rows"})
-        at_least(self, 0, dict.fromkeys(("noise", "lr", "lr_end"), "0 is none"))
+        at_least(self, 0, dict.fromkeys(("noise", "lr", "lr_end", "ema"), "0 is none"))
+        below(self, 1, AVERAGED)
 
 
 def distill(
@@ -112,7 +118,9 @@ def distill(
     generator = seeded(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
     identity = identify(config, student.config, table.names, seed) | ({"parents": parents} if parents else {})
+    average = Average(student.parameters(), config.ema) if config.ema else None
     parts = {"student": student, "optimizer": optimizer, "generator": generator}
+    parts |= {"average": average} if average else {}
     state = State(out, parts, identity=identity, kinds=KINDS | {"stage": DistillStage})
     refuse_other_parents(state.path, parents or {})
     step = evaluated = saved = 0
@@ -150,19 +158,22 @@ def distill(
             for _ in range(config.updates):
                 ids = torch.randint(filled, (config.minibatch,), generator=generator)
                 loss = _regress(student, optimizer, learner.seen(memory[ids]), labels[ids], bf16=config.bf16)
+            if average:
+                average.follow()
             step += 1
             samples = step * config.rows
             metrics = {"label_rmse": float(loss) ** 0.5} if step % 20 == 0 else {}
             due = samples - evaluated >= config.eval_every or step == total
             if due:
                 evaluated = samples
-                score = track(
-                    student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
-                )
+                with average.standing_in() if average else nullcontext():
+                    score = track(
+                        student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
+                    )
+                    if best is None or score.merit > best.merit:
+                        best = score
+                        student.save_pretrained(out, card(score), parents)
                 metrics |= {f"track/{k}": v for k, v in score.summary().items()} | env.episode_metrics()
-                if best is None or score.merit > best.merit:
-                    best = score
-                    student.save_pretrained(out, card(score), parents)
             if metrics:
                 log.write(samples, metrics)
             # Only right after an evaluation, from where its schedule and the episodes' sums start anew.

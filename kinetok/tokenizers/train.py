@@ -17,9 +17,9 @@ from pathlib import Path
 import torch
 
 from kinetok.checkpoint import CheckpointError, load_state
-from kinetok.config import ConfigError, at_least, diff, to_dict
+from kinetok.config import ConfigError, at_least, below, diff, to_dict
 from kinetok.rl import ranks
-from kinetok.rl.average import Average
+from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
@@ -77,9 +77,8 @@ class PPOStage:
 
     def __post_init__(self) -> None:
         at_least(self, 1, COUNTS)
-        at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor"), "0 is none"))
-        if not 0 <= self.ema < 1:
-            raise ConfigError(f"ema must be at least 0 and below 1, not {self.ema}; 0 is none")
+        at_least(self, 0, dict.fromkeys(("critic_warmup", "patience", "anchor", "ema"), "0 is none"))
+        below(self, 1, AVERAGED)
         if not self.leniency >= 1:
             raise ConfigError(f"leniency must be at least 1, not {self.leniency}; 1 is none")
         if not (0 <= self.arrivals <= 1 and self.reach > 0):

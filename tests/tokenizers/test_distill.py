@@ -83,6 +83,29 @@ def test_a_resumed_run_is_the_unbroken_one(whole, config, small, student, teache
     assert load_artifact(tmp_path).hash == load_artifact(out).hash
 
 
+def test_an_average_of_the_weights_is_judged_and_resumed(
+    config, small, standing, teachers, tmp_path, cut_off, monkeypatch
+):
+    steady, judged, real = replace(config, ema=0.9), [], module.track
+
+    def track(student, *args, **kwargs):
+        judged.append(next(student.parameters()).detach().clone())
+        return real(student, *args, **kwargs)
+
+    monkeypatch.setattr(module, "track", track)
+    pupil = new_tokenizer(small.tokenizer, standing, 0)
+    distill(pupil, teachers, standing, steady, tmp_path / "whole", quiet=True)
+    state = load_state(tmp_path / "whole" / "state.safetensors")[0]
+    first = next(name for name, _ in pupil.named_parameters())
+    assert torch.equal(judged[-1], state["tree.average.0"])
+    assert not torch.equal(judged[-1], state[f"tree.student.{first}"])
+    pupil = new_tokenizer(small.tokenizer, standing, 0)
+    cut_off(module, 3, lambda: distill(pupil, teachers, standing, steady, tmp_path / "cut", quiet=True))
+    distill(pupil, teachers, standing, steady, tmp_path / "cut", quiet=True)
+    assert same(load_state(tmp_path / "cut" / "state.safetensors")[0], state)
+    assert load_artifact(tmp_path / "cut").hash == load_artifact(tmp_path / "whole").hash
+
+
 def test_it_returns_the_kept_student_and_its_score(whole, config, student, teachers, standing, monkeypatch):
     out, score = whole
     kept = MotionTokenizer.from_pretrained(out)

@@ -107,7 +107,7 @@ def test_leniency_ends_episodes_later_at_first(config, student, standing, tmp_pa
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"leniency": 0.5}, "leniency must be at least 1, not 0.5"), ({"ema": 1.0}, "ema must be at least 0 and below 1")],
+    [({"leniency": 0.5}, "leniency must be at least 1, not 0.5"), ({"ema": 1.0}, "ema must be below 1, not 1.0; at 1")],
 )
 def test_a_stage_that_makes_no_sense_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
