@@ -203,8 +203,8 @@ PRETRAIN = {"laptop": laptop, "paper": paper, "tiny": tiny_prior}
 
 
 def laptop_skill() -> FinetuneConfig:
-    """Demonstrations in six minutes of one core, then reward in fifty-six of two, of which the critic has the first two
-    to itself; after half of it, it does most of what it will: docs/tutorial.md."""
+    """Demonstrations in eight minutes of one core, then reward in fifty-six of two, of which the critic has the first
+    two to itself; after half of it, it does most of what it will: docs/tutorial.md."""
     return FinetuneConfig(
         task=TargetConfig(full=0.3),  # where a reward is flat nothing keeps a body from drifting out (docs/skills.md)
         adapter=CoLAConfig(rank=32, alpha=64.0),

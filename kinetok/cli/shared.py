@@ -140,7 +140,7 @@ def show_json(data: dict, out: Path | None) -> None:
 
 
 PATHS = click.Path(path_type=Path)
-VIDEOS = (".mp4", ".gif")
+VIDEOS = (".mp4", ".gif")  # render/video.py: ENCODERS, which takes numpy to import
 EXPORTS = (".bvh", ".csv", ".npz")  # of programs other than this one
 TASK_NAMES = "target|steering|path"
 

@@ -8,6 +8,8 @@ import click
 import pytest
 
 from kinetok.cli import main
+from kinetok.cli.shared import VIDEOS
+from kinetok.render.video import ENCODERS
 from tests.cli.typed import kinetok
 
 
@@ -62,3 +64,7 @@ def test_a_traceback_can_be_had(tmp_path, monkeypatch):
     monkeypatch.setenv("KINETOK_TRACEBACK", "1")
     with pytest.raises(ValueError, match="does not exist"):
         kinetok("clips", "info", tmp_path / "no.txt")
+
+
+def test_the_videos_offered_are_those_that_can_be_written():
+    assert tuple(ENCODERS) == VIDEOS
