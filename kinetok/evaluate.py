@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from einops import rearrange
-from torch import Tensor, nn
+from torch import Tensor
 
 from kinetok import metrics
 from kinetok.adapters.rlft import Controller, TokenPolicy, play
@@ -59,9 +59,9 @@ def evaluate_tracking(
     """
     config = tokenizer.config
     table = ReferenceTable(ClipLibrary.of(clips), control_hz=config.scene.control_hz)
-    listener = _Listener(tokenizer)
+    codes: list[Tensor] = []
     score = track(
-        listener,
+        tokenizer,
         table,
         future=config.future,
         scene=config.scene,
@@ -70,6 +70,7 @@ def evaluate_tracking(
         from_start=from_start,
         threads=threads,
         seed=seed,
+        seen=(lambda obs: codes.append(tokenizer.encode(obs))) if tokenizer.quantizer.levels else None,
     )
     columns = ("success", "success_mean_error", "survival", "mpjpe_mm", "mpjpe_local_mm", "seconds")
     return {
@@ -88,31 +89,11 @@ def evaluate_tracking(
         "push_mps": push,
         "from_start": from_start,
         "seed": seed,
-    } | listener.usage()
-
-
-class _Listener:
-    """A tokenizer that acts and keeps its tokens; rows whose episode is over repeat it until the last one ends."""
-
-    def __init__(self, tokenizer: MotionTokenizer):
-        self._tokenizer, self._codes = tokenizer, []
-
-    def parameters(self) -> list[nn.Parameter]:
-        return list(self._tokenizer.parameters())
-
-    def observe(self, obs: Tensor) -> None:
-        self._tokenizer.observe(obs)
-
-    def act(self, obs: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        if self._tokenizer.quantizer.levels:
-            self._codes.append(self._tokenizer.encode(obs))
-        return self._tokenizer.act(obs)
-
-    def usage(self) -> dict[str, list[float]]:
-        if not self._codes:
-            return {}
-        layout = self._tokenizer.layout
-        return _usage(layout.to_tokens(torch.cat(self._codes)).numpy(force=True), layout.vocabulary)
+    } | (
+        _usage(tokenizer.layout.to_tokens(torch.cat(codes)).numpy(force=True), tokenizer.layout.vocabulary)
+        if codes
+        else {}
+    )
 
 
 def evaluate_prior(

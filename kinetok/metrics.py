@@ -1,7 +1,6 @@
 """Numbers that judge motion, tracking and tokens: pure numpy, arrays in, numbers out.
 
     mpjpe_mm(simulated, reference)                     # both (T, B, 3) metres, world frame
-    tight, loose = success(errors)                     # errors (T, B) metres
     apd(rollouts.reshape(M, T, -1))
 
 SI units in; z is up. T frames, B bodies, M rollouts, F feet, N steps, S tokens per step. Nothing is aligned
@@ -28,17 +27,6 @@ def mpjpe_mm(pos: ArrayLike, ref: ArrayLike, *, local: bool = False) -> float:
     return float(1000.0 * np.linalg.norm(pos - ref, axis=-1).mean())
 
 
-def success(errors: ArrayLike, threshold: float = 0.5) -> tuple[bool, bool]:
-    """(max form, mean form) of "the episode was tracked".
-
-    errors: (T, B) distances to the reference in metres. The max form holds if every body stays below
-    `threshold` in every frame (GPC, app. B.4, which weights clips by it); the mean form if the mean over all
-    frames and bodies does (GPC, table 1). A report says which one it gives.
-    """
-    errors = _array(errors, "T B", "errors")
-    return bool(errors.max() < threshold), bool(errors.mean() < threshold)
-
-
 def apd(trajectories: ArrayLike) -> float:
     """Average pairwise distance of rollouts that start alike, in the unit of the trajectories.
 
@@ -53,18 +41,6 @@ def apd(trajectories: ArrayLike) -> float:
         raise ValueError("trajectories holds one rollout; a pairwise distance needs at least two")
     total = sum(np.linalg.norm(x[i + 1 :] - x[i], axis=-1).mean(axis=1).sum() for i in range(rollouts - 1))
     return float(total) / (rollouts * (rollouts - 1) / 2)
-
-
-def ade(trajectories: ArrayLike, ref: ArrayLike) -> float:
-    """Average displacement error: mean over m, t of |x_m(t) - ref(t)|, in the unit of the input.
-
-    trajectories: (M, T, D). ref: (T, D). Rempe et al. 2021; GPC, tables 3 and 4, which do not say whether the
-    best rollout or the average is taken: this is the average, `min` over single rollouts gives the other.
-    """
-    x, target = _array(trajectories, "M T D", "trajectories"), _array(ref, "T D", "ref")
-    if x.shape[1:] != target.shape:
-        raise ValueError(f"ref is {target.shape}; the trajectories {x.shape} need {x.shape[1:]}")
-    return float(np.linalg.norm(x - target, axis=-1).mean())
 
 
 def mean_acceleration(pos: ArrayLike, fps: float) -> float:
@@ -101,14 +77,6 @@ def normalized_jerk(pos: ArrayLike, fps: float, window: float = 0.4, min_speed: 
     mean2 = np.lib.stride_tricks.sliding_window_view(jerk2, steps - 2, axis=0).mean(axis=-1)
     moving = peak >= min_speed
     return float(((steps / fps) ** 4 * mean2[moving] / peak[moving] ** 2).mean()) if moving.any() else float("nan")
-
-
-def survival(root_height: ArrayLike, minimum: float = 0.5) -> float:
-    """Share of rollouts that end with the root above `minimum` metres, whatever falls came before.
-
-    root_height: (M, T) in metres (GPC, app. C.3).
-    """
-    return float((_array(root_height, "M T", "root_height")[:, -1] > minimum).mean())
 
 
 def utilisation(tokens: ArrayLike, vocabulary: int) -> Floats:

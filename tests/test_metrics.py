@@ -18,16 +18,6 @@ def test_mpjpe_by_hand():
     assert metrics.mpjpe_mm(pos, ZEROS, local=True) == pytest.approx(250.0)  # the other body, as the root was moved
 
 
-@pytest.mark.parametrize(
-    ("worst", "expected"),
-    [(0.4, (True, True)), (0.6, (False, True)), (5.0, (False, False)), (np.nan, (False, False))],
-)
-def test_success_forms(worst, expected):
-    errors = np.zeros((2, 2))
-    errors[1, 1] = worst  # the mean is worst / 4
-    assert metrics.success(errors) == expected
-
-
 def test_apd_by_hand_and_against_the_definition():
     still = np.zeros((3, 5, 2))
     assert metrics.apd(still) == 0.0
@@ -37,12 +27,6 @@ def test_apd_by_hand_and_against_the_definition():
     pairs = [np.linalg.norm(a - b, axis=-1).mean() for a, b in itertools.combinations(x, 2)]
     assert metrics.apd(x) == pytest.approx(np.mean(pairs))
     assert metrics.apd(x + 1e6) == pytest.approx(np.mean(pairs))
-
-
-def test_ade_by_hand():
-    trajectories = np.zeros((2, 3, 2))
-    trajectories[1] = (3.0, 4.0)
-    assert metrics.ade(trajectories, np.zeros((3, 2))) == pytest.approx(2.5)
 
 
 def test_acceleration_of_free_fall():
@@ -71,12 +55,6 @@ def test_jerk_slides_windows_and_leaves_out_rest():
     assert np.isnan(metrics.normalized_jerk(np.zeros((100, 2, 3)), fps))
 
 
-def test_survival_asks_only_for_the_end():
-    height = np.array([[0.9, 0.1, 0.8], [0.9, 0.9, 0.2]])
-    assert metrics.survival(height) == 0.5
-    assert metrics.survival(height, minimum=0.1) == 1.0
-
-
 def test_token_statistics_by_hand():
     tokens = np.array([[0, 3], [0, 2], [0, 1], [0, 0]])
     np.testing.assert_allclose(metrics.utilisation(tokens, 4), [0.25, 1.0])
@@ -100,12 +78,10 @@ def test_foot_skate_counts_only_feet_on_the_ground():
             r"pos must be \(T, B, 3\) and not empty, not \(4, 3\)",
         ),
         (lambda: metrics.mpjpe_mm(ZEROS, ZEROS[1:]), "they must be alike"),
-        (lambda: metrics.success(np.zeros((0, 2))), r"errors must be \(T, B\) and not empty, not \(0, 2\)"),
         (
             lambda: metrics.apd(np.zeros((1, 5, 2))),
             "holds one rollout; a pairwise distance needs at least two",
         ),
-        (lambda: metrics.ade(np.zeros((2, 3, 2)), np.zeros((4, 2))), r"ref is \(4, 2\); the trajectories"),
         (lambda: metrics.mean_acceleration(ZEROS[:2], 30), "pos has 2 frames; at least 3 are needed"),
         (lambda: metrics.normalized_jerk(ZEROS, 30), "pos has 4 frames; at least 13 are needed"),
         (lambda: metrics.normalized_jerk(ZEROS, 5), "holds 2 steps at 5 fps; jerk needs at least 3"),

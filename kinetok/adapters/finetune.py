@@ -38,14 +38,13 @@ from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import seeded, torch_threads
-from kinetok.rl.training import Training
+from kinetok.rl.training import JUDGE, Training
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks import TASKS, GoalConfig, TargetConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
-from kinetok.tokenizers.train import in_scene
+from kinetok.tokenizers.train import COUNTS, in_scene
 
 METHODS = ("sft", "hindsight", "rl")
-JUDGE = 1_000_000  # added to the seed of a run: the episodes that choose its best are asked by no `evaluate task`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,13 +87,13 @@ class FinetuneConfig:
                 raise ConfigError(f"unknown method {method!r}{nearest(method, METHODS)}; methods: {', '.join(METHODS)}")
         if not self.methods or list(self.methods) != sorted(set(self.methods), key=METHODS.index):
             raise ConfigError(f"methods {', '.join(self.methods) or '(none)'}: name each once, sft before rl")
-        for name in ("samples", "rows", "eval_every", "eval_episodes", "save_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
+        at_least(self, 1, COUNTS | {
+            "samples": "to leave rl out, take it from methods",
+            "save_every": "give as many as samples for a single state at the end",
+        })  # fmt: skip
         at_least(self, 0, {"anchor": "0 is none", "ema": "0 is none"})
         below(self, 1, AVERAGED)
-        if self.eval_seconds < 0.1:
-            raise ConfigError(f"eval_seconds must be at least 0.1, not {self.eval_seconds}")
+        at_least(self, 0.1, {"eval_seconds": "an episode has one control step at least"})
 
 
 def reshaped(config: FinetuneConfig, *, task: str, adapter: str) -> FinetuneConfig:
@@ -164,9 +163,8 @@ def _finetune(
         "prior": fingerprint(prior.gpt),
         "tokenizer": prior.tokenizer.hash,
         "start": load_artifact(start, "adapter", ADAPTER).hash if start else "",
-        "clips": [clip.name for clip in clips],
         "seed": seed,
-    }
+    } | (ClipLibrary.of(clips).identity() if clips else {"clips": []})
     told = {"seed": seed, "threads": threads, "quiet": quiet}
     if "sft" in config.methods:
         _imitate(skill, config, places["sft"], clips, identity, **told)
@@ -274,7 +272,6 @@ def _look_back(
 ) -> None:
     table = ReferenceTable(ClipLibrary.of(clips), control_hz=skill.prior.fps) if clips else None
     task = task_of(config.task, skill.prior, config.hindsight.rows)
-    asking = task_of(config.task.restless(config.hindsight.restless), skill.prior, config.hindsight.rows)
     scene = skill.prior.tokenizer.config.scene
     world = replace(in_scene(config.env, scene), episode_seconds=config.hindsight.seconds + 1)
     env = Env(world, task, rows=config.hindsight.rows, threads=threads, seed=seed)
@@ -292,7 +289,7 @@ def _look_back(
         keep=lambda score: _keep(skill, config, out, story, identity["start"], seed, score),
         identity=identity | own,
         table=table,
-        asking=asking,
+        asking=lambda: task_of(config.task.restless(config.hindsight.restless), skill.prior, config.hindsight.rows),
         seed=seed,
         threads=threads,
         quiet=quiet,

@@ -83,21 +83,22 @@ def hindsight(
     keep: Callable[[S], None],
     identity: dict,
     table: ReferenceTable | None = None,
-    asking: Goal | None = None,
+    asking: Callable[[], Goal] | None = None,
     seed: int = 0,
     threads: int = 0,
     quiet: bool = False,
 ) -> None:
     """Adapt in place. After each round `evaluate` measures, and `keep` is called with the best score so far.
 
-    table: the clips to learn from, if any, and asking: what they are matched to, by default the task of env. `out`
-    receives metrics.jsonl and a state from which a later call with the same identity goes on after the last round.
+    table: the clips to learn from, if any, and asking: makes what they are matched to, anew each time; by default the
+    task of env. `out` receives metrics.jsonl and a state from which a later call with the same identity goes on after
+    the last round.
     """
     adapted, best, done = policy.adapted, -1e9, 0
     optimizer = torch.optim.Adam(adapted.trainable(), lr=config.lr, fused=True)
     generator = seeded(seed)
     parts = {"adapted": AdapterPart(adapted), "optimizer": optimizer, "generator": generator}
-    state = State(out, parts, identity=identity | {"stage": to_dict(config)}, kinds={"stage": HindsightConfig})
+    state = State(out, parts, identity=identity | {"hindsight": to_dict(config)}, kinds={"hindsight": HindsightConfig})
     memory: list[tuple[Tensor, ...]] = []
     if before := state.restore():
         meta, kept = before
@@ -168,7 +169,7 @@ def demonstrated(
     policy: TokenPolicy,
     env: Env,
     table: ReferenceTable,
-    asking: Goal | None,
+    asking: Callable[[], Goal] | None,
     config: HindsightConfig,
     seed: int,
     threads: int,
@@ -185,7 +186,7 @@ def demonstrated(
         return relabel(roam(policy.tokenizer, table, transitions=config.transitions, **told), env, config, seed)
     if generator is not None:
         told |= {"samples": config.samples // 2, "driver": policy.controller(generator)}
-    goal = asking or cast(Goal, env.task)
+    goal = asking() if asking else cast(Goal, env.task)
     states, c, tokens = demonstrate(policy.tokenizer, table, goal, doomed=config.doomed, **told)
     return states, c, tokens, torch.ones(len(states))
 

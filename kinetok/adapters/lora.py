@@ -19,8 +19,9 @@ from kinetok.adapters.inject import AdaptedLinear, Condition, Model, check_rank,
 
 @dataclass(frozen=True, kw_only=True)
 class LoRAConfig:
-    """kind: "lora". rank: r. alpha: alpha / r scales the update. dropout: of what A reads, while training.
-    targets: layers to adapt (see inject.py). hidden: width of the net behind the task token (see condition.py)."""
+    """kind: "lora". rank: r. alpha: alpha / r scales the update. dropout: of what A reads, in supervised
+    fine-tuning alone. targets: layers to adapt (see inject.py). hidden: width of the net behind the task token (see
+    condition.py)."""
 
     kind: Literal["lora"] = "lora"
     rank: int = 16

@@ -226,7 +226,7 @@ def play(
             step = env.step(controller(torch.as_tensor(obs)).numpy(force=True))
             body = env.sim.state()
             head = {"head_height_m": body.pos[:, heads[0], 2]} if heads else {}
-            card.add(step.reward, step.terminated, task.measure(body) | head)
+            card.add(step.reward, step.terminated, step.failed, task.measure(body) | head)
             obs = step.obs
     frames = np.stack(qpos) if qpos else np.empty((0, 0, prior.character.nq))
     return Played(score=TaskScore(measures=card.summary()), qpos=frames, markers=markers, fps=prior.fps)

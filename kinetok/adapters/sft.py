@@ -9,7 +9,6 @@ The clips ask for nothing, so the nets that read the task observation stay at th
 the style comes whatever the task says, exactly, and reinforcement learning finds them untouched.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,9 @@ import torch
 from torch import Tensor
 
 from kinetok.adapters.adapted import Adapted, AdapterPart
-from kinetok.config import ConfigError, to_dict
+from kinetok.config import ConfigError, at_least, to_dict
 from kinetok.gpt.data import TokenDataset, record
+from kinetok.gpt.pretrain import EVAL_SAMPLES, held_out
 from kinetok.logger import Logger
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
@@ -30,8 +30,6 @@ from kinetok.rl.rollout import seeded
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.tokenizer import MotionTokenizer
-
-EVAL_SAMPLES = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +51,11 @@ class SFTConfig:
     env: EnvConfig = EnvConfig(reset_noise=0.02, push=0.3)
 
     def __post_init__(self) -> None:
-        for name in ("samples", "rows", "iterations", "batch", "eval_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, not {getattr(self, name)}")
+        at_least(
+            self,
+            1,
+            dict.fromkeys(("samples", "rows", "iterations", "batch", "eval_every"), "without, nothing is learned"),
+        )
         if not 0 <= self.held_out < 1 or (self.held_out and self.rows < 2):
             raise ConfigError(f"held_out is a share of the {self.rows} rows that leaves some, not {self.held_out}")
 
@@ -80,8 +80,7 @@ def supervise(
     nothing is held out. `out` receives metrics.jsonl and a state from which a later call goes on, bit for bit.
     """
     library = ClipLibrary.of(clips)
-    frames = hashlib.sha256(library.frames.tobytes()).hexdigest()
-    identity = {"sft": to_dict(config), "frames": frames} | identity
+    identity = {"sft": to_dict(config)} | library.identity() | identity
     step, best = 0, {"held_out/cross_entropy": math.inf}
     parameters = [p for p in adapted.gpt.parameters() if p.requires_grad]  # all but the nets that read c
     optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
@@ -106,8 +105,7 @@ def supervise(
         code_noise=config.code_noise,
         quiet=quiet,
     )
-    learn, hold = data.split(config.held_out)
-    hold = hold[torch.linspace(0, len(hold) - 1, min(len(hold), EVAL_SAMPLES)).long()] if len(hold) else hold
+    learn, hold = data.split(config.held_out, EVAL_SAMPLES)
     with Logger(out, total=config.iterations, title="sft", start=step, quiet=quiet) as log:
         while step < config.iterations:
             for group in optimizer.param_groups:
@@ -139,14 +137,9 @@ def supervise(
     return best
 
 
-@torch.no_grad()
 def evaluate(adapted: Adapted, data: TokenDataset, ids: Tensor) -> dict[str, float]:
-    """Cross-entropy in nats per token and accuracy on the samples ids; nothing where there are none."""
-    sums = dict.fromkeys(("cross_entropy", "accuracy"), 0.0)
-    for part in ids.split(1024):
-        metrics = _loss(adapted, data, part)[1]
-        sums = {name: total + float(metrics[name]) * len(part) for name, total in sums.items()}
-    return {f"held_out/{name}": total / len(ids) for name, total in sums.items()} if len(ids) else {}
+    """`held_out` of an adapter."""
+    return held_out(lambda part: _loss(adapted, data, part)[1], ids)
 
 
 def _loss(

@@ -60,7 +60,7 @@ def evaluate_tracking(tokenizer, paths, hours, out, episodes, push, from_start, 
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
 @click.option("--episodes", default=64, show_default=True, help="Motions to sample.")
-@click.option("--seconds", default=20.0, show_default=True, help="Length of each; a fall ends it.")
+@click.option("--seconds", default=20.0, show_default=True, help="Length of each; who has fallen may get up.")
 @click.option("--push", default=0.0, help="Push every character once, at step 200, by so many m/s.")
 @click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
 @option_threads

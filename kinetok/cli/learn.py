@@ -81,7 +81,7 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     else:
         skill = Skill.from_pretrained(start, prior, rebase=rebase)
         model, base = skill.prior, skill.base
-        config = replace(config, task=skill.task, adapter=skill.adapted.config)
+        config = replace(config, task=skill.task, adapter=skill.adapted.config, policy=skill.policy)
     config = reshaped(config, task=task or config.task.kind, adapter=adapter or config.adapter.kind)
     config = override(replace(config, methods=tuple(method.split(","))), settings)
     clips = load_clips(paths, hours, seed)

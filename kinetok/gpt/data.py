@@ -76,8 +76,10 @@ class TokenDataset:
         std, mean = torch.std_mean(self.states.double(), dim=0, correction=0)
         return mean.float(), std.float()
 
-    def split(self, share: float) -> tuple[Tensor, Tensor]:
-        """Sample ids (M1,), (M2,) to learn from and to hold out: whole worlds, as neighbours in time are alike."""
+    def split(self, share: float, most: int | None = None) -> tuple[Tensor, Tensor]:
+        """Sample ids (M1,), (M2,) to learn from and to hold out: whole worlds, as neighbours in time are alike.
+
+        most: of what is held out, so many spread evenly at most."""
         if not 0 <= share < 1:
             raise ValueError(f"the held-out share must lie in [0, 1), not {share}")
         worlds = self.world.unique()
@@ -85,7 +87,10 @@ class TokenDataset:
         if held >= len(worlds):
             raise ValueError(f"cannot hold out {held} of {len(worlds)} worlds; record with more rows")
         out = torch.isin(self.world, worlds[len(worlds) - held :])
-        return torch.nonzero(~out).flatten(), torch.nonzero(out).flatten()
+        hold = torch.nonzero(out).flatten()
+        if most and len(hold) > most:
+            hold = hold[torch.linspace(0, len(hold) - 1, most).long()]
+        return torch.nonzero(~out).flatten(), hold
 
     def save(self, path: Path, meta: dict[str, Any]) -> None:
         """Write one file; meta is JSON-able and comes back from `load`."""

@@ -14,7 +14,6 @@ Departures from GPC
 """
 
 import copy
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -133,10 +132,8 @@ def pretrain(
     library = ClipLibrary.of(clips)
     identity = {
         "tokenizer": tokenizer.hash,
-        "clips": list(library.names),
-        "frames": hashlib.sha256(library.frames.tobytes()).hexdigest(),
         "seed": seed,
-    }
+    } | library.identity()
     shape = config.gpt(tokenizer.layout, tokenizer.sizes["state"])
     start = _start(config.start, shape) if config.start else None
     out.mkdir(parents=True, exist_ok=True)
@@ -162,14 +159,14 @@ def pretrain(
 
     best = train(gpt, data, config, out, identity=identity, save=save, seed=seed, threads=threads, quiet=quiet)
     if config.refine.rounds:
-        prior = Prior.from_pretrained(plain, tokenizer)
+        prior, hold = Prior.from_pretrained(plain, tokenizer), data.split(config.held_out, EVAL_SAMPLES)[1]
         refine(
             prior,
             data,
             config.refine,
             out / "refine",
             identity=identity | {"stage": to_dict(config.refine), "plain": load_artifact(plain).hash},
-            save=lambda refined, metrics: save(refined.gpt, best | metrics, out),
+            save=lambda refined, metrics: save(refined.gpt, best | evaluate(refined.gpt, data, hold) | metrics, out),
             seed=seed,
             threads=threads,
             quiet=quiet,
@@ -198,8 +195,7 @@ def train(
     average = copy.deepcopy(gpt).eval().requires_grad_(False)
     optimizer = _optimizer(gpt, config)
     generator = seeded(seed)
-    learn, hold = data.split(config.held_out)
-    hold = hold[torch.linspace(0, len(hold) - 1, min(len(hold), EVAL_SAMPLES)).long()] if len(hold) else hold
+    learn, hold = data.split(config.held_out, EVAL_SAMPLES)
     step, best = 0, {"held_out/cross_entropy": math.inf}
     parts = {"gpt": gpt, "average": average, "optimizer": optimizer, "generator": generator}
     own = identity | {"config": to_dict(replace(config, refine=RefineConfig(rounds=0)))}  # refining comes after
@@ -229,10 +225,17 @@ def train(
 
 @torch.no_grad()
 def evaluate(gpt: GPT, data: TokenDataset, ids: Tensor) -> dict[str, float]:
-    """Cross-entropy in nats per token and accuracy on the samples ids; nothing where there are none."""
+    """`held_out` of a GPT."""
+    return held_out(lambda part: gpt.loss(data.states[part], data.tokens[part].long())[1], ids)
+
+
+@torch.no_grad()
+def held_out(measure: Callable[[Tensor], dict[str, Tensor]], ids: Tensor) -> dict[str, float]:
+    """Cross-entropy in nats per token and accuracy of the samples ids; nothing where there are none. measure: both, as
+    means over some of the samples."""
     sums = dict.fromkeys(("cross_entropy", "accuracy"), 0.0)
     for part in ids.split(1024):
-        _, metrics = gpt.loss(data.states[part], data.tokens[part].long())
+        metrics = measure(part)
         sums = {name: total + float(metrics[name]) * len(part) for name, total in sums.items()}
     return {f"held_out/{name}": total / len(ids) for name, total in sums.items()} if len(ids) else {}
 

@@ -7,7 +7,7 @@ it move freely, under small pushes, leaves out what came before a fall, and goes
 half and half with the tracker's roll-outs, so that no motion is forgotten. This is filtered behaviour cloning, the
 first step of expert iteration; GPC has nothing like it, its prior is made of 600 hours.
 
-The best round by survival is kept (`Survival`), the first one being the prior as it came.
+The best round by survival is kept, the first one being the prior as it came.
 """
 
 import copy

@@ -39,7 +39,7 @@ def nucleus(logits: Tensor, p: float, least: int = 1) -> Tensor:
     if p == 1.0:
         return logits > -torch.inf
     probs = F.softmax(logits, dim=-1, dtype=torch.float32)
-    top, mass = _top(probs, p)
+    top, mass = _top(probs, p, least)
     # Option i is needed when those before it do not reach p yet; the first `least` always are.
     needed = (1 + (mass[:, :-1] < p).sum(-1, keepdim=True)).clamp_min(min(least, mass.shape[-1]))
     border = top.gather(-1, needed - 1)
@@ -52,10 +52,12 @@ def nucleus(logits: Tensor, p: float, least: int = 1) -> Tensor:
     return keep
 
 
-def _top(probs: Tensor, p: float) -> tuple[Tensor, Tensor]:
-    """The k largest probabilities, falling, and their running sum, k so large that all rows reach p."""
-    if probs.shape[-1] > SORT_UP_TO:
-        for k in TOP_K:
+def _top(probs: Tensor, p: float, least: int) -> tuple[Tensor, Tensor]:
+    """The k largest probabilities, falling, and their running sum, k so large that all rows reach p and `least`.
+
+    On a GPU all of them: asking whether fewer are enough would wait for it, and a replayed graph cannot ask."""
+    if probs.shape[-1] > SORT_UP_TO and probs.device.type == "cpu":
+        for k in (k for k in TOP_K if k >= least):
             top = probs.topk(k, dim=-1).values
             mass = top.cumsum(-1)
             if bool((mass[:, -1] >= p).all()):

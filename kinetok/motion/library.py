@@ -22,7 +22,7 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -188,6 +188,15 @@ class ClipLibrary:
         if len(self.parts) > 1 or frames.dtype != np.float32 or self.chosen is not None or self.mirror:
             raise ValueError("frames are one array only in all of one float32 file; use clip() or at()")
         return frames
+
+    def identity(self) -> dict[str, Any]:
+        """Which clips these are, so that a run goes on with no others: their names, and a sha256 of what they hold."""
+        digest = hashlib.sha256()
+        for index in range(len(self)):
+            clip = self.clip(index)
+            digest.update(f"{clip.character} {clip.fps} {clip.loop} {clip.qpos.shape}".encode())
+            digest.update(np.ascontiguousarray(clip.qpos, dtype="<f4").data)
+        return {"clips": list(self.names), "frames": digest.hexdigest()}
 
     def _place(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Part, index in it and whether it is mirrored, for clips ids (N,)."""

@@ -19,6 +19,7 @@ from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Policy
 from kinetok.rl.rollout import Rollout
 
+LEAST_RATE = 1e-5  # of the policy, unless it begins with a lower one
 CHUNK = 1024  # samples of a minibatch whose gradients are taken at a time: what a core's cache holds of a token policy
 
 
@@ -48,6 +49,11 @@ class PPOConfig:
                 f"not {self.target_kl} and {self.target_kl_end}"
             )
 
+        if not 0 < self.lr <= self.lr_max:
+            raise ConfigError(
+                f"lr is above 0 and at most lr_max, {self.lr_max:g}, not {self.lr:g}; lower it or raise lr_max"
+            )
+
     def aim(self, done: float) -> float:
         """The divergence aimed at when a share of the training is done: from one end to the other geometrically."""
         return self.target_kl * ((self.target_kl_end or self.target_kl) / self.target_kl) ** done
@@ -60,7 +66,7 @@ class Optimizers:
         self.parameters = [p for p in policy.parameters() if p.requires_grad]
         self.actor = torch.optim.Adam(self.parameters, lr=config.lr, fused=True)
         self.critic = torch.optim.Adam(critic.parameters(), lr=config.critic_lr, fused=True)
-        self.range = (1e-5, config.lr_max)
+        self.range = (min(LEAST_RATE, config.lr), config.lr_max)
 
     @property
     def lr(self) -> float:

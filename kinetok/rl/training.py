@@ -32,6 +32,8 @@ from kinetok.rl.ppo import Optimizers, PPOConfig, update
 from kinetok.rl.returns import gae
 from kinetok.rl.rollout import Rollout, World, collect, seeded
 
+JUDGE = 1_000_000  # added to the seed of a run: the episodes that choose its best are not those of an `evaluate`
+
 
 class Score(Protocol):
     """What an evaluation found: merit orders artifacts, summary is logged, to_json survives a resumption."""

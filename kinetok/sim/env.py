@@ -40,7 +40,7 @@ class EnvConfig:
 @dataclass(frozen=True, kw_only=True)
 class Step:
     """obs (N, O); reward (N,); terms: reward parts (N,); terminated, truncated (N,) bool; done: ids (k,) of finished
-    rows; final_obs (k, O): their last observations before the reset."""
+    rows; final_obs (k, O): their last observations before the reset; failed: ids (k,) of rows that blew up."""
 
     obs: np.ndarray
     reward: np.ndarray
@@ -49,6 +49,7 @@ class Step:
     truncated: np.ndarray
     done: np.ndarray
     final_obs: np.ndarray
+    failed: np.ndarray
 
 
 class Task(Protocol):
@@ -76,7 +77,7 @@ class Env:
         self.rng = np.random.default_rng(seed)
         self.sim = BatchSim(build_scene(task.character, config.scene), rows, threads)
         self.limit = round(config.episode_seconds * config.scene.control_hz)
-        self.age = np.zeros(rows, dtype=int)
+        self.age, self._begun = np.zeros(rows, dtype=int), np.zeros(rows, dtype=int)  # _begun: the age at the start
         self.failed_simulations = 0
         self._returns = np.zeros(rows)
         self._finished: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -98,7 +99,7 @@ class Env:
         ids = np.arange(self.rows)
         self._start(ids)
         if spread:
-            self.age[:] = self.rng.integers(0, self.limit, self.rows)
+            self.age[:] = self._begun[:] = self.rng.integers(0, self.limit, self.rows)
             self.task.spread()
         return self.task.observe(self.sim.state())
 
@@ -122,7 +123,7 @@ class Env:
         if len(failed):
             final = np.where(np.isfinite(final), final, 0.0)
         if len(done) and self.config.autoreset:
-            self._finished.append((self._returns[done].copy(), self.age[done].copy(), terminated[done]))
+            self._finished.append((self._returns[done].copy(), (self.age - self._begun)[done], terminated[done]))
             self.task.finished(done, terminated[done])
             self._start(done)
             obs[done] = self.task.observe(self.sim.state(done), done)
@@ -135,17 +136,18 @@ class Env:
             truncated=truncated,
             done=done,
             final_obs=final,
+            failed=failed,
         )
 
     def episode_metrics(self) -> dict[str, float]:
         """Means over the episodes finished since the last call."""
         if not self._finished:
             return {}
-        returns, ages, terminated = (np.concatenate(parts) for parts in zip(*self._finished, strict=True))
+        returns, steps, terminated = (np.concatenate(parts) for parts in zip(*self._finished, strict=True))
         self._finished.clear()
         return {
             "episode_return": float(returns.mean()),
-            "episode_seconds": float(ages.mean() / self.config.scene.control_hz),
+            "episode_seconds": float(steps.mean() / self.config.scene.control_hz),
             "failure_rate": float(terminated.mean()),
         }
 
@@ -167,7 +169,7 @@ class Env:
         if self.config.reset_noise:
             qpos, qvel = perturb(self.task.character, qpos, qvel, self.config.reset_noise, self.rng)
         self.sim.set_state(ids, qpos, qvel)
-        self.age[ids] = 0
+        self.age[ids] = self._begun[ids] = 0
         self._returns[ids] = 0
 
     def _push(self) -> None:

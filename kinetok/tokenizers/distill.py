@@ -24,6 +24,7 @@ from kinetok.resume import State
 from kinetok.rl import ranks
 from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.rollout import seeded, torch_threads
+from kinetok.rl.training import JUDGE
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.tasks.roaming import REACH, Roaming
@@ -117,7 +118,7 @@ def distill(
     learner = _View(student, task, False)
     generator = seeded(seed)
     optimizer = torch.optim.Adam(student.parameters(), lr=config.lr, fused=True)
-    identity = identify(config, student.config, table.names, seed) | ({"parents": parents} if parents else {})
+    identity = identify(config, student.config, table.identity, seed) | ({"parents": parents} if parents else {})
     average = Average(student.parameters(), config.ema) if config.ema else None
     parts = {"student": student, "optimizer": optimizer, "generator": generator}
     parts |= {"average": average} if average else {}
@@ -132,6 +133,11 @@ def distill(
         env.load_state_dict(json.loads(meta["env"]))
         step, best = meta["step"], meta.get("score") and TrackingScore.from_json(meta["score"])
         evaluated = saved = step * config.rows
+
+    def judge() -> TrackingScore:
+        episodes = config.eval_episodes
+        return track(student, table, future=future, scene=scene, episodes=episodes, threads=threads, seed=seed + JUDGE)
+
     # The memory is filled anew after every save, so that a resumed run and an unbroken one are the same.
     filled = cursor = 0
     total = max(config.samples // config.rows, 1)
@@ -167,9 +173,7 @@ def distill(
             if due:
                 evaluated = samples
                 with average.standing_in() if average else nullcontext():
-                    score = track(
-                        student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads
-                    )
+                    score = judge()
                     if best is None or score.merit > best.merit:
                         best = score
                         student.save_pretrained(out, card(score), parents)
@@ -184,7 +188,7 @@ def distill(
                 obs = torch.as_tensor(env.reset(spread=True))
                 filled = cursor = 0
     student.load_state_dict(MotionTokenizer.from_pretrained(out).state_dict())
-    return best or track(student, table, future=future, scene=scene, episodes=config.eval_episodes, threads=threads)
+    return best or judge()
 
 
 class _View:

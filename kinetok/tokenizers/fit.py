@@ -35,13 +35,13 @@ from kinetok.resume import refuse_changed
 from kinetok.rl import ranks
 from kinetok.rl.ppo import PPOConfig
 from kinetok.rl.rollout import torch_threads
-from kinetok.rl.training import Progress
+from kinetok.rl.training import JUDGE, Progress
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.distill import DistillStage, distill
 from kinetok.tokenizers.quantizer import ContinuousConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
-from kinetok.tokenizers.track import TrackingScore
+from kinetok.tokenizers.track import TrackingScore, track
 from kinetok.tokenizers.train import (
     KINDS,
     PPOStage,
@@ -157,22 +157,20 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         parents = {"start": start.hash}
     if student.quantizer.levels:
         student.layout  # noqa: B018  refuses codes that do not divide into tokens, before hours of training
+    teachers = _teachers(config, config.teachers, names) if config.teachers and "distill" in config.stages else []
     refuse_foreign(out)
     out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    scores: dict[str, TrackingScore] = {}
+    stories: dict[str, str] = {}
     if "teacher" in config.stages:
         train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
     story = ["start"] if config.start else []
     if "distill" in config.stages:
-        folder = config.teachers or str(out / "teachers")
-        places = [_place_of("teachers", folder, name) for name in names]
-        known = {place: MotionTokenizer.from_pretrained(place) for place in dict.fromkeys(places)}
-        same = {teacher.hash: teacher for teacher in known.values()}  # links and copies are labelled together
-        teachers = [same[known[place].hash] for place in places]
+        teachers = teachers or _teachers(config, out / "teachers", names)
         parents |= {f"teacher/{name}": teacher.hash for name, teacher in zip(names, teachers, strict=True)}
         story += ["teacher", "distill"]
-        scores["distill"] = distill(
+        stories["distill"] = " -> ".join(story)
+        distill(
             student,
             teachers * 2 if images else teachers,
             table,
@@ -180,14 +178,15 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             out / "distill",
             seed=seed,
             threads=threads,
-            card=lambda score: tokenizer_card(student, table.names, " -> ".join(story), seed, score),
+            card=lambda score: tokenizer_card(student, table.names, stories["distill"], seed, score),
             mirrored=[False] * len(clips) + [True] * len(images),
             parents=parents,
         )
         parents = {"distill": load_artifact(out / "distill").hash} | parents
     if "ppo" in config.stages:
         story.append("ppo")
-        scores["ppo"] = train_ppo(
+        stories["ppo"] = " -> ".join(story)
+        train_ppo(
             student,
             table,
             config.ppo,
@@ -195,29 +194,54 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
             seed=seed,
             threads=threads,
             title="ppo through the bottleneck",
-            card=lambda score: tokenizer_card(student, table.names, " -> ".join(story), seed, score),
+            card=lambda score: tokenizer_card(student, table.names, stories["ppo"], seed, score, config.ppo.eval_push),
             parents=parents,
         )
     taught = _taught_numbers(out / "teachers", table.names, len(names))
-    if not scores:
+    if not stories:
         Console().print(clip_table(names, {"teacher": taught[: len(names)]}))
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
-    best = max(scores, key=lambda stage: scores[stage].merit)
-    ranks.first(lambda: _publish(out, best, scores[best], table.names, taught, started))
+    ranks.first(lambda: _publish(out, stories, config, table, taught, started, seed=seed, threads=threads))
     return MotionTokenizer.from_pretrained(out)
 
 
 def _publish(
-    out: Path, best: str, score: TrackingScore, names: Sequence[str], taught: np.ndarray, started: float
+    out: Path,
+    stories: Mapping[str, str],
+    config: FitConfig,
+    table: ReferenceTable,
+    taught: np.ndarray,
+    started: float,
+    *,
+    seed: int,
+    threads: int,
 ) -> None:
-    """Copy the best stage's artifact to `out`, and show how well it follows each clip."""
-    artifact = load_artifact(out / best)
+    """Copy the artifact of the best stage to `out`, and show how well it follows each clip. Where there are several,
+    all are judged by the same episodes, those of the last one's evaluations."""
+    last, names = config.distill if tuple(stories) == ("distill",) else config.ppo, table.names
+    push = last.eval_push if isinstance(last, PPOStage) else 0.0
+    tokenizers = {stage: MotionTokenizer.from_pretrained(out / stage) for stage in stories}
+    scores = {
+        stage: track(
+            tokenizer,
+            table,
+            future=config.tokenizer.future,
+            scene=config.tokenizer.scene,
+            episodes=last.eval_episodes,
+            push=push,
+            threads=threads,
+            seed=seed + JUDGE,
+        )
+        for stage, tokenizer in tokenizers.items()
+    }
+    best = max(scores, key=lambda stage: scores[stage].merit)
+    score, artifact = scores[best], load_artifact(out / best)
     save_artifact(
         out,
         kind=artifact.kind,
         config=artifact.config,
         tensors=artifact.tensors,
-        card=(artifact.path / "README.md").read_text(encoding="utf-8"),
+        card=tokenizer_card(tokenizers[best], names, stories[best], seed, score, push),
         parents=artifact.parents,
     )
     found = {best: np.stack([score.success, score.mpjpe_mm], axis=1)}
@@ -311,9 +335,9 @@ def _taught(clip: Clip, others: Sequence[Clip], config: FitConfig, out: Path, se
     meta = load_state(state)[1]
     parents = _start(config, clip.name)[1]
     refuse_other_parents(state, parents)
-    identity = identify(config.teacher, _settings(config), [clip.name], seed)
+    identity = identify(config.teacher, _settings(config), ClipLibrary.of([clip]).identity(), seed)
     identity |= {"parents": parents} if parents else {}
-    identity |= {"others": [other.name for other in others] or [clip.name]} if config.teacher.arrivals else {}
+    identity |= {"others": ClipLibrary.of(others or [clip]).identity()} if config.teacher.arrivals else {}
     refuse_changed(state, meta["identity"], identity, KINDS | {"stage": PPOStage})
     progress = Progress(**meta["progress"])
     return progress.samples >= config.teacher.samples or good_enough(progress, config.teacher)
@@ -354,6 +378,25 @@ def _refuse_other_shape(what: str, wanted: TokenizerConfig, found: MotionTokeniz
         raise ConfigError(f"{what} is of another shape: {'; '.join(changed)}")
 
 
+def _teachers(config: FitConfig, place: Path | str, names: Sequence[str]) -> list[MotionTokenizer]:
+    """Who teaches each of the clips: the tokenizer at `place`, or those in that folder. What one of them knows holds in
+    its own body, physics and control rate."""
+    places = [_place_of("teachers", str(place), name) for name in names]
+    known = {place: MotionTokenizer.from_pretrained(place) for place in dict.fromkeys(places)}
+    for place, teacher in known.items():
+        there, here = (
+            {"character": shape.character, "scene": to_dict(shape.scene)}
+            for shape in (teacher.config, config.tokenizer)
+        )
+        if changed := diff(there, here):
+            raise ConfigError(
+                f"teacher {place} moves another body or in other physics than tokenizer says: {'; '.join(changed)}; "
+                "set tokenizer.* as it has them, or take another teacher"
+            )
+    same = {teacher.hash: teacher for teacher in known.values()}  # links and copies are labelled together
+    return [same[known[place].hash] for place in places]
+
+
 def _teach(
     clip: Clip, others: Sequence[Clip], config: FitConfig, out: Path, seed: int, *, threads: int, quiet: bool
 ) -> str:
@@ -374,7 +417,7 @@ def _teach(
         seed=seed,
         threads=threads,
         title=f"teacher {clip.name}",
-        card=lambda score: tokenizer_card(teacher, [clip.name], "teacher", seed, score),
+        card=lambda score: tokenizer_card(teacher, [clip.name], "teacher", seed, score, config.teacher.eval_push),
         parents=parents,
         others=origins,
         quiet=quiet,
@@ -383,7 +426,12 @@ def _teach(
 
 
 def tokenizer_card(
-    tokenizer: MotionTokenizer, names: Sequence[str], story: str, seed: int, score: TrackingScore
+    tokenizer: MotionTokenizer,
+    names: Sequence[str],
+    story: str,
+    seed: int,
+    score: TrackingScore,
+    push: float = 0.0,
 ) -> str:
     """The model card: use, training, inputs and outputs, results and limits."""
     config = tokenizer.config
@@ -392,6 +440,7 @@ def tokenizer_card(
         f"| {name} | {100 * s:.0f} % | {100 * m:.0f} % | {e:.0f} |"
         for name, s, m, e in zip(score.names, score.success, score.success_mean_error, score.mpjpe_mm, strict=True)
     )
+    pushed = f", pushed by {push:g} m/s every two seconds" if push else ""
     total = (
         f"| all | {100 * score.success.mean():.1f} % | {100 * score.success_mean_error.mean():.1f} % "
         f"| {score.mpjpe_mm.mean():.1f} |"
@@ -416,7 +465,7 @@ Turns a reference motion into codes and codes into joint torques, in physics at 
 - {tokens}quantizer `{to_dict(config.quantizer)}`.
 - Stages: {story}. Seed {seed}. Clips: {", ".join(names)}.
 
-## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, started with 0.01 rad of noise
+## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, started with 0.01 rad of noise{pushed}
 
 Success: largest body error of the episode below 0.5 m; mean form: mean body error below 0.5 m.
 

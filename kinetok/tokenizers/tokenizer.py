@@ -4,11 +4,11 @@
     tokens = tokenizer.layout.to_tokens(tokenizer.encode(obs))     # from the reference window alone
     action = tokenizer.decode(codes, state)                        # PD targets in radians; no reference
 
-GPC sec. 5 and app. B: z = E(window), code = Q(z), action = D(state, code). The encoder of a tokenizer sees only
-the reference window relative to the body, the decoder only the proprioceptive state and the code. A *teacher* is
-the same class with the `continuous` quantizer; it alone may set encoder_inputs beyond the window and `residual`,
-an action around the reference's own PD target, which leaks the reference and is therefore refused for kinds that
-have codes.
+GPC sec. 5 and app. B: z = E(window), code = Q(z), action = D(state, code). The encoder of a tokenizer sees the
+reference window relative to the body, and more only where encoder_inputs says so; the decoder only the proprioceptive
+state and the code. A *teacher* is the same class with the `continuous` quantizer; it alone may set `residual`, an
+action around the reference's own PD target, which leaks the reference and is therefore refused for kinds that have
+codes.
 """
 
 from collections.abc import Mapping

@@ -3,17 +3,20 @@
     score = track(tokenizer, table, episodes=8, seconds=20)
     score.success.mean(), score.mpjpe_mm.mean()
 
-An episode of a loop runs `seconds`, from phases spread evenly over the cycle (or all from its first frame, as papers
-do: from a frame in mid-leap a recorded velocity may lead nowhere); an episode of any other clip runs from its first
-frame to its end. Start poses are disturbed by 0.01 rad, so that episodes differ. An episode has failed when
-the mean body error exceeds 0.5 m, or is not a number in a blown-up simulation, and then ends early. Under pushes it
-goes on until it falls as well: who was pushed away and walks on has lost its place, not its balance.
+An episode of a loop runs `seconds`, from phases spread evenly over the cycle, the first of them drawn by the seed (or
+all from its first frame, as papers do: from a frame in mid-leap a recorded velocity may lead nowhere); an episode of
+any other clip runs from its first frame to its end. Start poses are disturbed by 0.01 rad, so that episodes differ. An
+episode has failed when the mean body error exceeds 0.5 m, or is not a number in a blown-up simulation, and then ends
+early. Under pushes it goes on until it falls as well: who was pushed away and walks on has lost its place, not its
+balance.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from kinetok.rl.nets import Actor
 from kinetok.rl.rollout import torch_threads
@@ -90,11 +93,14 @@ def track(
     from_start: bool = False,
     threads: int = 0,
     seed: int = 0,
+    seen: Callable[[Tensor], None] | None = None,
 ) -> TrackingScore:
-    """Score an actor on every clip of a table. from_start: loops begin at their first frame alone."""
+    """Score an actor on every clip of a table. from_start: loops begin at their first frame alone. seen: told at every
+    step what the rows observe whose episodes go on."""
     clips = len(table.names)
     fixed = np.repeat(np.arange(clips), episodes)
-    share = np.tile(np.arange(episodes) / episodes, clips) * (not from_start)
+    begin = np.random.default_rng([seed, 5]).random()
+    share = np.tile((np.arange(episodes) + begin) / episodes, clips) * (not from_start)
     loops = table.last - table.first > table.cycle
     starts = (share * np.where(loops, table.cycle, 0)[fixed]).astype(int)
     rows = len(fixed)
@@ -118,9 +124,11 @@ def track(
     obs = env.reset()
     with torch.no_grad(), torch_threads(1):
         while running.any():
+            counts = running & ~failed
+            if seen and counts.any():
+                seen(torch.as_tensor(obs[counts]))
             step = env.step(actor.act(torch.as_tensor(obs))[0].numpy(force=True))
             obs, steps = step.obs, steps + 1
-            counts = running & ~failed
             offset = task.offset[counts]
             error, apart = (
                 np.nan_to_num(lengths(o), nan=np.inf, posinf=np.inf) for o in (offset, offset - offset[:, :1])

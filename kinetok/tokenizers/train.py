@@ -10,7 +10,7 @@ From a start the critic learns first (`critic_warmup`), and the policy may be he
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from kinetok.rl.average import AVERAGED, Average
 from kinetok.rl.nets import Critic
 from kinetok.rl.policy import Gaussian
 from kinetok.rl.ppo import PPOConfig
-from kinetok.rl.training import Progress, Training
+from kinetok.rl.training import JUDGE, Progress, Training
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.reward import TrackingReward
 from kinetok.sim.scene import SceneConfig
@@ -104,7 +104,7 @@ def train_ppo(
     others: clips to arrive from, see `arrivals`; by default the table's own. parents: hashes of what the actor was
     made from, kept in the artifact; a state that had others is refused.
     """
-    identity = identify(config, actor.config, table.names, seed) | ({"parents": parents} if parents else {})
+    identity = identify(config, actor.config, table.identity, seed) | ({"parents": parents} if parents else {})
     refuse_other_parents(out / "state.safetensors", parents or {})
     future, scene = actor.config.future, actor.config.scene
     tracking = TrackingConfig(future=future, failure=config.failure, reward=config.reward, from_start=config.from_start)
@@ -114,7 +114,7 @@ def train_ppo(
         origins = others or table
         share, reach = config.arrivals, config.reach
         task = Arriving(tracking, table, origins, rows=rows, share=share, reach=reach)
-        identity |= {"others": list(origins.names)}
+        identity |= {"others": origins.identity}
     env = Env(in_scene(config.env, scene), task, rows=rows, threads=threads, seed=ranks.own(seed))
     torch.manual_seed(seed)
     critic = Critic(env.obs_size, config.critic, actor.config.activation)
@@ -135,7 +135,9 @@ def train_ppo(
 
     def evaluate() -> TrackingScore:
         episodes, push = config.eval_episodes, config.eval_push
-        return track(actor, table, future=future, scene=scene, episodes=episodes, push=push, threads=threads)
+        return track(
+            actor, table, future=future, scene=scene, episodes=episodes, push=push, threads=threads, seed=seed + JUDGE
+        )
 
     def settle(share: float) -> None:
         policy.log_std = config.log_std[0] + share * (config.log_std[1] - config.log_std[0])
@@ -170,9 +172,9 @@ def in_scene(env: EnvConfig, scene: SceneConfig) -> EnvConfig:
 KINDS = {"tokenizer": TokenizerConfig}  # of the identity below, besides its stage
 
 
-def identify(config: object, tokenizer: TokenizerConfig, names: Sequence[str], seed: int) -> dict:
-    """What a run is, for `refuse_changed`: a state goes on only under the same."""
-    return {"stage": to_dict(config), "tokenizer": to_dict(tokenizer), "seed": seed, "clips": list(names)}
+def identify(config: object, tokenizer: TokenizerConfig, clips: dict, seed: int) -> dict:
+    """What a run is, for `refuse_changed`: a state goes on only under the same. clips: ClipLibrary.identity."""
+    return {"stage": to_dict(config), "tokenizer": to_dict(tokenizer), "seed": seed} | clips
 
 
 def refuse_other_parents(path: Path, parents: dict[str, str]) -> None:

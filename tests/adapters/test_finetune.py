@@ -322,7 +322,7 @@ def test_the_adapter_of_another_prior_is_refused_by_both_hashes(models, plain, t
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: {"config": replace(c, ppo=replace(c.ppo, lr=0.5))}, "stage.ppo.lr: 0.0004 -> 0.5"),
+        (lambda c: {"config": replace(c, ppo=replace(c.ppo, lr=5e-4))}, "stage.ppo.lr: 0.0004 -> 0.0005"),
         (lambda c: {"config": replace(c, task=SteeringConfig())}, "stage.task.kind: target -> steering"),
         (lambda c: {"config": override(c, ["adapter.rank=3"])}, "stage.adapter.rank: 2 -> 3"),
         (lambda c: {"seed": 4}, "seed: 0 -> 4"),

@@ -76,6 +76,7 @@ def test_a_skill_is_measured_and_taken_further(skill, prior, tmp_path):
     assert further.parents["skill"] == load_artifact(skill, "adapter", ADAPTER).hash
     assert further.config["adapted"]["adapter"]["kind"] == "lora"
     assert further.config["skill"]["task"]["distance"] == [2.0, 3.0]
+    assert further.config["skill"]["policy"] == load_artifact(skill, "adapter", ADAPTER).config["skill"]["policy"]
 
 
 def test_a_skill_is_shown_with_what_is_asked_of_it(skill):

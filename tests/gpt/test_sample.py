@@ -55,6 +55,10 @@ def test_a_nucleus_of_at_least_so_many_by_hand():
     logits = logits_of(0.01, 0.9, 0.05, 0.04)
     for least, kept in ((1, [1]), (2, [1, 2]), (3, [1, 2, 3]), (9, [0, 1, 2, 3])):
         assert nucleus(logits, 0.8, least)[0].nonzero().flatten().tolist() == kept
+    peaked, flat = torch.zeros(1, 5000), torch.zeros(1, 5000)
+    peaked[0, :3] = 20.0
+    for rows in (peaked, torch.cat([peaked, flat])):  # as many whatever the other rows need
+        assert nucleus(rows, 0.8, 100)[0].sum() == 100
     assert nucleus(logits, 0.97, 2)[0].nonzero().flatten().tolist() == [1, 2, 3]  # the mass asks for more
 
 

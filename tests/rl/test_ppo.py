@@ -104,6 +104,11 @@ def test_the_rate_follows_the_kl():
     for _ in range(60):
         optimizers.adapt(kl=1.0, target=0.01)
     assert optimizers.lr == 1e-5
+    low = Trial(replace(CONFIG, lr=1e-6)).optimizers
+    low.adapt(kl=1.0, target=0.01)
+    assert low.lr == 1e-6  # what begins lower is not raised
+    with pytest.raises(ConfigError, match=r"at most lr_max, 0\.001, not 0\.005; lower it or raise lr_max"):
+        PPOConfig(lr=5e-3)
 
 
 def test_the_divergence_aimed_at_falls_geometrically():

@@ -223,8 +223,10 @@ def test_an_observation_that_is_not_finite_stops_the_run(tmp_path):
 
 def test_another_run_is_refused_saying_what_changed(tmp_path):
     Run(tmp_path).train()
-    with pytest.raises(CheckpointError, match=r"state\.safetensors: .*stage\.lr: 0\.001 -> 0\.1; seed: 0 -> 3.*--out"):
-        Run(tmp_path, stage=Stage(lr=0.1), seed=3).train()
+    with pytest.raises(
+        CheckpointError, match=r"state\.safetensors: .*stage\.lr: 0\.001 -> 0\.0005; seed: 0 -> 3.*--out"
+    ):
+        Run(tmp_path, stage=Stage(lr=5e-4), seed=3).train()
     with pytest.raises(CheckpointError, match=r"stage\.samples: 512 -> 256"):
         Run(tmp_path, stage=Stage(samples=256)).train()
     assert Run(tmp_path, stage=Stage(samples=576)).train().samples == 576  # a longer run is the same run

@@ -38,6 +38,15 @@ def test_time_and_clip_ends_truncate(table):
         assert env.episode_metrics() == {}
 
 
+def test_episodes_last_as_long_as_they_did_whenever_they_began(table):
+    env = make(table, loose=True, episode_seconds=0.3, **pinned(0, 0))
+    env.reset(spread=True)
+    begun = env.age.copy()
+    for a in actions(env, 9):
+        env.step(a)
+    assert len(set(begun)) > 1 and env.episode_metrics()["episode_seconds"] == pytest.approx((9 - begun).mean() / 30)
+
+
 def test_a_failure_terminates_and_is_not_truncated_too(table):
     env = make(table, episode_seconds=1 / 30, **pinned(0, 0))  # time is over after one step, for every row
     env.reset()

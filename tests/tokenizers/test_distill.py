@@ -10,6 +10,7 @@ from kinetok.checkpoint import CheckpointError, load_artifact, load_state
 from kinetok.config import ConfigError
 from kinetok.logger import read_metrics
 from kinetok.motion.library import ClipLibrary
+from kinetok.rl.training import JUDGE
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers import distill as module
@@ -109,7 +110,7 @@ def test_an_average_of_the_weights_is_judged_and_resumed(
 def test_it_returns_the_kept_student_and_its_score(whole, config, student, teachers, standing, monkeypatch):
     out, score = whole
     kept = MotionTokenizer.from_pretrained(out)
-    again = track(kept, standing, future=kept.config.future, episodes=config.eval_episodes)
+    again = track(kept, standing, future=kept.config.future, episodes=config.eval_episodes, seed=JUDGE)
     assert again.to_json() == score.to_json()
 
     def fail(*args, **kwargs):
@@ -129,7 +130,7 @@ def test_when_nothing_better_follows_a_resume_the_kept_score_is_returned(
     monkeypatch.setattr(module, "track", lambda *a, **k: replace(real(*a, **k), mpjpe_mm=np.full(2, 9e9)))
     score = distill(student, teachers, standing, config, tmp_path, quiet=True)
     assert load_artifact(tmp_path).hash == kept
-    again = real(student, standing, future=student.config.future, episodes=config.eval_episodes)
+    again = real(student, standing, future=student.config.future, episodes=config.eval_episodes, seed=JUDGE)
     assert score.to_json() == again.to_json()
 
 

@@ -55,20 +55,22 @@ def done(clips, small, tmp_path_factory):
 
 def test_another_tokenizer_teaches_and_another_one_is_gone_on_with(done, clips, small, tmp_path):
     out, tokenizer = done
-    later = override(small, ["stages=distill", f"teachers={out}", f"start={out}"])
+    start = MotionTokenizer.from_pretrained(out / "ppo")
+    slow = ["distill.lr=1e-5", "distill.lr_end=1e-5"]
+    later = override(small, ["stages=distill", f"teachers={out}", f"start={out / 'ppo'}", *slow])
     taught = fit(clips, later, tmp_path / "one", seed=0)
     parents = load_artifact(tmp_path / "one").parents
-    assert parents == dict.fromkeys(("start", "teacher/wave", "teacher/sweep"), tokenizer.hash)
+    assert parents == {"start": start.hash} | dict.fromkeys(("teacher/wave", "teacher/sweep"), tokenizer.hash)
     apart = override(small, ["stages=distill", f"teachers={out / 'teachers'}"])
     fit(clips, apart, tmp_path / "two", seed=0)
     assert load_artifact(tmp_path / "two").parents == {
         f"teacher/{name}": load_artifact(out / "teachers" / name).hash for name in ("wave", "sweep")
     }
     # It began where the other one was: what it does is nearer to it than what a fresh student does.
-    obs = torch.randn(64, sum(tokenizer.sizes.values()), generator=torch.Generator().manual_seed(0))
+    obs = torch.randn(64, sum(start.sizes.values()), generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         wanted, began, fresh = (
-            t.act(obs)[0] for t in (tokenizer, taught, MotionTokenizer.from_pretrained(tmp_path / "two"))
+            t.act(obs)[0] for t in (start, taught, MotionTokenizer.from_pretrained(tmp_path / "two"))
         )
     assert (began - wanted).norm() < 0.5 * (fresh - wanted).norm()
 
@@ -251,6 +253,14 @@ def other_body(tmp_path) -> Clip:
         ),
         (lambda clips, small, tmp_path: ([], small), ValueError, "at least one clip"),
         (
+            lambda clips, small, tmp_path: (
+                clips,
+                override(small, ["stages=distill", "teachers=humanoid-teacher", "tokenizer.scene.control_hz=60"]),
+            ),
+            ConfigError,
+            "humanoid-teacher moves another body or in other physics than tokenizer says: scene.control_hz: 30 -> 60",
+        ),
+        (
             lambda clips, small, tmp_path: ([other_body(tmp_path)], small),
             ConfigError,
             "tokenizer.character is 'humanoid'; set tokenizer.character=",
@@ -307,6 +317,12 @@ def test_finished_teachers_are_not_passed_off_as_others(done, clips, small):
     changed = replace(small, teacher=replace(small.teacher, rows=64))
     with pytest.raises(CheckpointError, match=r"stage\.rows: 32 -> 64"):
         fit(clips, changed, out)
+
+
+def test_other_motions_of_the_same_names_are_refused(done, clips, small):
+    out, _ = done
+    with pytest.raises(CheckpointError, match=r"frames: "):
+        fit([replace(clip, qpos=clip.qpos[:-1]) for clip in clips], small, out)
 
 
 def test_more_samples_take_a_finished_teacher_further(clips, small, tmp_path):

@@ -37,14 +37,23 @@ def test_episodes_of_one_clip_differ(standing, good):
     assert (once.mpjpe_mm != good.mpjpe_mm).all()
 
 
+def phases(seed: int, episodes: int, cycle: int = 30) -> list[int]:
+    """Frames at which the episodes of a loop begin."""
+    begin = np.random.default_rng([seed, 5]).random()
+    return [int((k + begin) / episodes * cycle) for k in range(episodes)]
+
+
 def test_a_loop_is_entered_at_phases_spread_over_it(wave):
     """Jumping by 2 m at frame 10 of 30, a loop loses every episode there; only the phases tell how late."""
     clip = wave("jump", 1.0, loop=True)
     clip.qpos[10:, 0] += 2.0
     table = ReferenceTable(ClipLibrary.of([clip]), seconds=2)
-    score = track(Follow(28), table, future=(1,), episodes=2, seconds=1.5)
-    # the episode from frame 0 ends with its 10th step; that from frame 15 with its 25th, at frame 10 of the next cycle
-    assert score.seconds.tolist() == [(10 + 25) / 2 / 30] and score.success.tolist() == [0.0]
+    for seed in (0, 2):
+        score = track(Follow(28), table, future=(1,), episodes=2, seconds=1.5, seed=seed)
+        # every episode ends at frame 10, of its cycle or of the next
+        steps = [(10 - start) % 30 for start in phases(seed, 2)]
+        assert score.seconds.tolist() == [sum(steps) / 2 / 30] and score.success.tolist() == [0.0]
+    assert phases(0, 2) != phases(2, 2)
     begun = track(Follow(28), table, future=(1,), episodes=2, seconds=1.5, from_start=True)
     assert begun.seconds.tolist() == [10 / 30]
 
@@ -106,8 +115,18 @@ def test_the_limit_is_the_clips_end_or_the_seconds_of_a_loop(wave, good):
     assert good.limit.tolist() == [1.0, 1.0]
     table = ReferenceTable(ClipLibrary.of([wave("loop", loop=True), wave("once", 0.5)]), seconds=2)
     limits = [track(Follow(28), table, future=(1,), episodes=2, seconds=s).limit.tolist() for s in (1.2, 9.0)]
-    # the loop's table ends after 3 s, entered at 0 and 0.5 s
-    assert limits == [[1.2, 0.5], [2.75, 0.5]]
+    left = np.mean([(90 - start) / 30 for start in phases(0, 2)])  # the loop's table ends after 3 s
+    assert limits == [[1.2, 0.5], [pytest.approx(left), 0.5]]
+
+
+def test_what_is_seen_is_what_goes_on(wave):
+    table = ReferenceTable(ClipLibrary.of([wave("long"), wave("short", 0.5)]))
+    seen: list[int] = []
+    track(Follow(28), table, future=(1,), episodes=2, seen=lambda obs: seen.append(len(obs)))
+    assert seen == [4] * 15 + [2] * 15  # nothing of an episode that is over
+    seen.clear()
+    track(Follow(28, offset=float("nan")), table, future=(1,), episodes=2, seen=lambda obs: seen.append(len(obs)))
+    assert seen == [4]  # nor of one that has failed
 
 
 def test_a_score_from_before_limits_keeps_its_merit(good):

@@ -19,7 +19,7 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import AHEAD, GOAL, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
 CATCH_UP = 2.0  # seconds in which a demonstration returns to the path
 JUMP = 1.0  # metres
@@ -121,7 +121,7 @@ class Path:
         obs, task = self.world.blank(body)
         points = self.points[:, self.now + self.arc :: self.arc][:, : self.config.waypoints]
         points = points if ids is None else points[ids]
-        task[:] = in_heading(points - body.pos[:, :1, :2], body.quat).reshape(task.shape)
+        task[:] = in_heading(points - body.pos[:, :1, :2], rotation.heading(body.quat)).reshape(task.shape)
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -150,7 +150,7 @@ class Path:
         now, parts = np.arange(len(root))[:, None], []
         for number in range(1, self.config.waypoints + 1):
             ahead = np.broadcast_to(now + number * self.arc, heading.shape)
-            parts.append(from_heading(later(root, ahead) - root, heading))
+            parts.append(in_heading(later(root, ahead) - root, heading))
         return np.concatenate(parts, axis=-1), now + self.config.waypoints * self.arc <= ends
 
     def wish(self, c: np.ndarray) -> np.ndarray:

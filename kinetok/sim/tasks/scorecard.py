@@ -4,7 +4,7 @@
     card, obs = Scorecard(rows=64, control_hz=30), env.reset()
     for _ in range(600):
         step = env.step(policy(obs))
-        card.add(step.reward, step.terminated, task.measure(env.sim.state()))
+        card.add(step.reward, step.terminated, step.failed, task.measure(env.sim.state()))
     card.summary()                                               # JSON-able, see Scorecard.summary
 
 Without autoreset a row that has fallen goes on: it still misses targets and strays, unless it gets up. It knows no
@@ -23,19 +23,24 @@ class Scorecard:
         self.rows, self.control_hz, self.steps = rows, control_hz, 0
         self._reward = np.zeros(rows)
         self._return = np.zeros(rows)
-        self._fell, self._down = np.zeros(rows, dtype=bool), np.zeros(rows, dtype=bool)
+        self._fell, self._down, self._failed = (np.zeros(rows, dtype=bool) for _ in range(3))
         self._sums: dict[str, float] = {}
         self._counts: dict[str, int] = {}
 
-    def add(self, reward: np.ndarray, terminated: np.ndarray, measures: dict[str, np.ndarray]) -> None:
-        """One control step: reward and terminated (N,) of the environment, and measures (N,) of the task, after it."""
+    def add(
+        self, reward: np.ndarray, terminated: np.ndarray, failed: np.ndarray, measures: dict[str, np.ndarray]
+    ) -> None:
+        """One control step: reward, terminated (N,) and failed (k,) of the environment, and measures (N,) of the task,
+        after it. A row whose simulation failed is put on its feet again by MuJoCo; it counts as down from then on."""
         for name, values in {"reward": reward, "terminated": terminated, **measures}.items():
             if np.shape(values) != (self.rows,):
                 raise ValueError(f"{name} has shape {np.shape(values)}; this scorecard is of {self.rows} rows")
         self.steps += 1
+        self._failed[failed] = True
+        terminated = terminated | self._failed
         self._reward += np.where(terminated, 0.0, reward)
         self._return += np.where(self._fell, 0.0, reward)
-        self._fell, self._down = self._fell | terminated, terminated.copy()
+        self._fell, self._down = self._fell | terminated, terminated
         for name, values in measures.items():
             known = values[~np.isnan(values)]
             self._sums[name] = self._sums.get(name, 0.0) + float(known.sum(dtype=np.float64))

@@ -21,7 +21,7 @@ from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import GOAL, SIDE, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
 AHEAD = 1.5  # seconds that hindsight looks ahead at most
 
@@ -96,8 +96,8 @@ class Steering:
         obs, task = self.world.blank(body)
         rows = slice(None) if ids is None else ids
         velocity = self.speed[rows, None] * direction(self.angle[rows])
-        task[:, :2] = in_heading(velocity, body.quat)
-        task[:, 2:] = in_heading(direction(self.facing[rows]), body.quat)
+        task[:, :2] = in_heading(velocity, rotation.heading(body.quat))
+        task[:, 2:] = in_heading(direction(self.facing[rows]), rotation.heading(body.quat))
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -138,7 +138,7 @@ class Steering:
         ahead = now + rng.integers(hz // 2, round(AHEAD * hz) + 1, heading.shape)
         velocity = (later(root, ahead) - later(root, ahead - hz // 3)) * (hz / (hz // 3))
         facing = direction(later(heading, ahead))
-        c = np.concatenate([from_heading(velocity, heading), from_heading(facing, heading)], axis=-1)
+        c = np.concatenate([in_heading(velocity, heading), in_heading(facing, heading)], axis=-1)
         return c, ahead <= ends
 
     def wish(self, c: np.ndarray) -> np.ndarray:

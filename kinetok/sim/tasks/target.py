@@ -14,11 +14,12 @@ from typing import Literal
 
 import numpy as np
 
+from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim.batch import BodyState
 from kinetok.sim.tasks.marker import DONE, GOAL, Marker
-from kinetok.sim.tasks.upright import Upright, check_ranges, direction, from_heading, in_heading, later, length
+from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
 AHEAD = 2.0  # seconds that hindsight looks ahead at most
 WALKING, RESTING = 0.4, 0.15  # m/s over half a second
@@ -104,7 +105,7 @@ class Target:
         """state | task (n, O) float32 of all rows or of rows ids."""
         obs, task = self.world.blank(body)
         target = self.target if ids is None else self.target[ids]
-        task[:] = _seen(in_heading(target - body.pos[:, 0, :2], body.quat))
+        task[:] = _seen(in_heading(target - body.pos[:, 0, :2], rotation.heading(body.quat)))
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -145,7 +146,7 @@ class Target:
         )
         rests = (speed[..., 0] < RESTING) & (np.linalg.norm(there - root, axis=-1) < self.config.near)
         told = (longest >= hz // 2) & (rests | (speed[..., 0] > WALKING))
-        return _seen(from_heading((there - root + on).astype(np.float32), heading)), told
+        return _seen(in_heading((there - root + on).astype(np.float32), heading)), told
 
     def wish(self, c: np.ndarray) -> np.ndarray:
         """Where the root should be in a second (N, 2), metres in its heading frame, by task observations c (N, 4)."""

@@ -18,7 +18,7 @@ from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.motion.clip import Clip
-from kinetok.motion.kinematics import kinematics
+from kinetok.motion.kinematics import Motion, kinematics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim import observe
 from kinetok.sim.batch import BodyState
@@ -79,7 +79,7 @@ class ReferenceTable:
 
     def __init__(self, library: ClipLibrary, *, control_hz: int = 30, seconds: float = 20.0):
         self.character = Character.load(library.character)
-        self.names, self.control_hz = library.names, control_hz
+        self.names, self.control_hz, self.identity = library.names, control_hz, library.identity()
         self.cycle = np.maximum((library.seconds * control_hz + 1e-6).astype(int), 1)
         counts = self.cycle + round(seconds * control_hz) * library.loop + 1
         self.first = np.cumsum(counts) - counts
@@ -100,8 +100,11 @@ class ReferenceTable:
 
 
 def _tabulated(body: Character, clip: Clip, frames: int, control_hz: int) -> dict[str, np.ndarray]:
-    """What a table holds of the first frames of a clip, by column."""
-    motion = kinematics(body, clip.at(np.arange(frames) / control_hz), control_hz)
+    """What a table holds of the first frames of a clip, by column. A loop had a frame before its first, and has one
+    after its last, so that it moves there as it does when it comes by again."""
+    beyond = int(clip.loop)
+    motion = kinematics(body, clip.at(np.arange(-beyond, frames + beyond) / control_hz), control_hz)
+    motion = Motion(**{name: values[beyond : beyond + frames] for name, values in vars(motion).items()})
     pos, mat = motion.xpos.astype(np.float32), rotation.to_matrix(motion.xquat).astype(np.float32)
     quat = motion.xquat[:, 0].astype(np.float32)
     # PD target that makes a joint with damping kd follow a moving reference: q + kd / kp * qd

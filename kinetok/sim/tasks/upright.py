@@ -10,7 +10,6 @@ start, between starts too: the environment saves it for a resumed training.
 
 import numpy as np
 
-from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
 from kinetok.sim import observe
@@ -72,11 +71,12 @@ class Upright:
         return broken | (body.pos[:, 0, 2] < self.fall_height), truncated
 
 
-def in_heading(vectors: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """World-frame vectors of the plane (n, 2) or (n, K, 2) as root quaternions (n, 4) see them: x ahead, y left."""
-    angle = rotation.heading(quat).reshape(-1, *(1,) * (vectors.ndim - 2))
+def in_heading(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """World-frame vectors of the plane (..., 2) or (..., K, 2), float32, as headings angle (...), radians, see them: x
+    ahead, y left."""
+    angle = angle.reshape(*angle.shape, *(1,) * (vectors.ndim - 1 - angle.ndim))
     cos, sin, x, y = np.cos(angle), np.sin(angle), vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1).astype(np.float32)
 
 
 def direction(angle: np.ndarray) -> np.ndarray:
@@ -100,9 +100,3 @@ def later(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """values (T, N, ...) at step steps (T, N) instead, clipped to the last."""
     steps = steps.clip(0, len(values) - 1)
     return np.take_along_axis(values, steps.reshape(*steps.shape, *(1,) * (values.ndim - 2)), axis=0)
-
-
-def from_heading(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """World-frame vectors (T, N, 2) as headings angle (T, N), radians, see them: x ahead, y left."""
-    cos, sin, x, y = np.cos(angle), np.sin(angle), vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1).astype(np.float32)

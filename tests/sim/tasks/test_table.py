@@ -54,7 +54,7 @@ def test_two_seconds_of_random_targets_with_pushes(humanoid, name):
         np.testing.assert_allclose(sum(step.terms.values()), step.reward, rtol=1e-6)
         ends["terminated"] += step.terminated.sum()
         ends["truncated"] += step.truncated.sum()
-        card.add(step.reward, step.terminated, task.measure(env.sim.state()))
+        card.add(step.reward, step.terminated, step.failed, task.measure(env.sim.state()))
         assert all(task.markers(row) for row in range(ROWS))
     assert ends["terminated"] > 0  # a body thrown about falls, and that is a failure and no end of time
     assert env.episode_metrics()["failure_rate"] > 0

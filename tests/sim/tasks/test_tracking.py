@@ -39,6 +39,12 @@ def test_table(table):
     np.testing.assert_allclose(table.root[:91, 0], 0.3 * np.arange(91) / 30, atol=1e-4)
 
 
+def test_a_loop_begins_and_ends_as_it_goes_on(table):
+    np.testing.assert_allclose(table.qvel[0], table.qvel[30], atol=1e-4)
+    np.testing.assert_allclose(table.qvel[90], table.qvel[60], atol=1e-4)
+    np.testing.assert_allclose(table.body.linear[0], table.body.linear[30], atol=1e-4)
+
+
 def test_target_leads_the_reference(table, humanoid):
     frame, u = 10, int(humanoid.hinge[0, 1])
     q, d = int(humanoid.hinge[0, 0]), int(humanoid.dof[u])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kinetok.config import ConfigError
+from kinetok.rotation import heading
 from kinetok.sim import observe
 from kinetok.sim.tasks.upright import Upright, check_ranges, in_heading
 from tests.sim.tasks.planar import body_at, standing
@@ -18,8 +19,10 @@ def make(humanoid, qpos, qvel, rows=3, starts=None, fall_height=0.5) -> Upright:
 def test_the_plane_from_a_heading():
     # heading along y: the world's x is to the right, its y ahead
     quat = body_at([[0, 0]], angle=np.pi / 2).quat
-    np.testing.assert_allclose(in_heading(np.array([[1.0, 0.0]]), quat), [[0, -1]], atol=1e-7)
-    np.testing.assert_allclose(in_heading(np.array([[[0.0, 1.0], [2.0, 3.0]]]), quat), [[[1, 0], [3, -2]]], atol=1e-6)
+    np.testing.assert_allclose(in_heading(np.array([[1.0, 0.0]]), heading(quat)), [[0, -1]], atol=1e-7)
+    np.testing.assert_allclose(
+        in_heading(np.array([[[0.0, 1.0], [2.0, 3.0]]]), heading(quat)), [[[1, 0], [3, -2]]], atol=1e-6
+    )
 
 
 def test_the_state_comes_first(humanoid):
