@@ -95,7 +95,7 @@ def save_artifact(
     extra: further top-level keys of the config file, for other programs; `load_artifact` does not read them.
     """
     path = Path(path)
-    refuse_foreign(path, files)
+    refuse_foreign(path, kind, files)
     header = {"kinetok": __version__, "kind": kind, "hash": "", "parents": parents or {}, "config": config}
     taken = header.keys() & (extra or {}).keys()
     if taken:
@@ -287,15 +287,29 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def refuse_foreign(path: Path, files: Files = MODEL) -> None:
-    """Refuse to write over a file, or over a config, model or README.md of these names that is not ours."""
+def refuse_foreign(path: Path, kind: str, files: Files = MODEL) -> None:
+    """Refuse to write an artifact of this kind over a file, over one of another kind, or over a config, model or
+    README.md of these names that is not ours."""
     if path.exists() and not path.is_dir():
         raise CheckpointError(f"{path} is a file; an artifact is a directory, choose another path")
+    for other in (MODEL, ADAPTER):
+        found = _kind(path / other.config)
+        if found not in ("", kind):
+            raise CheckpointError(f"{path} holds a {found!r}, which a {kind!r} would replace; choose another directory")
     present = [name for name in (files.config, files.model, CARD) if (path / name).exists()]
     if present and not _is_ours(path, files):
         raise CheckpointError(
             f"{path} holds a {present[0]} that kinetok did not write; choose an empty or new directory"
         )
+
+
+def _kind(config: Path) -> str:
+    """Of the artifact whose config file that is; nothing where it is none of ours."""
+    try:
+        header = json.loads(config.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ""
+    return str(header.get("kind", "")) if isinstance(header, dict) and "kinetok" in header else ""
 
 
 def _is_ours(path: Path, files: Files) -> bool:
@@ -314,6 +328,9 @@ def _read_header(path: Path, files: Files) -> dict[str, Any]:
     if not path.is_dir():
         siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
         names = packaged(files) if path.parent == Path() else []
+        if path.parent == Path() and path.name in [*packaged(MODEL), *packaged(ADAPTER)]:
+            other = _kind(PACKAGED / path.name / (MODEL if path.name in packaged(MODEL) else ADAPTER).config)
+            raise CheckpointError(f"the packaged {path} is a {other!r}; of the kind asked for: {', '.join(names)}")
         known = f"; packaged: {', '.join(names)}" if names else ""
         raise CheckpointError(f"there is no directory {path}{nearest(path.name, siblings + names)}{known}")
     config = path / files.config

@@ -41,7 +41,7 @@ def run_demo(out: Path, *, seconds: float = 8.0, seed: int = 0, console: Console
     clip = library.clip(0)
 
     console.print(f"[bold]1.[/] Tracking the packaged clip {clip.name!r} in simulation, token by token")
-    stream = encode_clip(tokenizer, clip, seconds=min(seconds, clip.seconds), seed=seed)
+    stream = encode_clip(tokenizer, clip, seconds=min(seconds, clip.seconds))
     reference = clip.at(np.arange(len(stream.simulated)) / fps)
     error = mpjpe_mm(kinematics(body, stream.simulated, fps).xpos, kinematics(body, reference, fps).xpos)
     for step in range(3):

@@ -34,7 +34,7 @@ from kinetok.motion.library import ClipLibrary
 from kinetok.rl.rollout import seeded
 from kinetok.sim.tasks import TASKS
 from kinetok.sim.tasks.tracking import ReferenceTable
-from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.tokenizer import MotionTokenizer, require_character
 from kinetok.tokenizers.track import track
 
 UPRIGHT = 0.5  # metres, of the root
@@ -57,8 +57,9 @@ def evaluate_tracking(
     Means over clips, and `clips` with the numbers of each. utilisation, perplexity: of each token position over all
     control steps, None for a continuous tokenizer. push: m/s at the root, every two seconds.
     """
-    config = tokenizer.config
-    table = ReferenceTable(ClipLibrary.of(clips), control_hz=config.scene.control_hz)
+    config, library = tokenizer.config, ClipLibrary.of(clips)
+    require_character(library, config.character)
+    table = ReferenceTable(library, control_hz=config.scene.control_hz)
     codes: list[Tensor] = []
     score = track(
         tokenizer,

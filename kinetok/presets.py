@@ -244,6 +244,7 @@ def tiny_skill() -> FinetuneConfig:
     return FinetuneConfig(
         adapter=CoLAConfig(rank=2, alpha=4.0, hidden=8),
         sft=SFTConfig(samples=320, rows=16, iterations=10, batch=32, eval_every=5),
+        hindsight=HindsightConfig(rounds=2, rows=16, seconds=2.0, iterations=10, batch=32, samples=640),
         samples=512,
         rows=32,
         eval_every=256,

@@ -153,7 +153,7 @@ def _finetune(
     skill = Skill(adapted=adapted, prior=prior, base=str(base), task=config.task, policy=config.policy)
     places = {method: out / method for method in config.methods[:-1]} | {config.methods[-1]: out}
     for place in places.values():
-        refuse_foreign(place, ADAPTER)
+        refuse_foreign(place, "adapter", ADAPTER)
     out.mkdir(parents=True, exist_ok=True)
     if not quiet:
         count, frozen, share = parameters_of(adapted)

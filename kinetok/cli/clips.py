@@ -1,5 +1,6 @@
 """Commands about motion and bodies: `kinetok clips ...`, `kinetok characters ...`."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,14 @@ from typing import Any
 import click
 
 from kinetok.cli.shared import (
+    COUNT,
+    DAY,
     EXPORTS,
     PATHS,
+    SECONDS,
     VIDEOS,
     Chain,
+    Number,
     check_suffix,
     each_clip,
     one_clip,
@@ -207,6 +212,9 @@ def clips_import(
     if out.suffix or not append:
         check_suffix(out, ".safetensors")
     read, left_out = [], []  # (name, seconds, body), errors
+    taken = set(ClipLibrary.open(out).names) if append and out.exists() else set()
+    if character and character.endswith(".xml"):
+        character = str(Path(character).resolve())  # the library names it, wherever it is read
 
     def refuse(error: ValueError) -> None:
         left_out.append(error)
@@ -215,6 +223,11 @@ def clips_import(
     def found():
         for clip in each_clip(paths, character, parts=parts, skip=refuse if skip else None, **told):
             read.append((clip.name, clip.seconds, clip.character))
+            if clip.name in taken:
+                free = next(name for k in itertools.count(2) if (name := f"{clip.name}-{k}") not in taken)
+                say(f"{clip.source}: another clip is called {clip.name}, so this one is {free}")
+                clip = replace(clip, name=free)
+            taken.add(clip.name)
             if clip.character != read[0][2]:
                 raise ValueError(
                     f"{read[0][0]} is of {read[0][2]!r}; {clip.name} is of {clip.character!r}: a library holds motion "
@@ -245,6 +258,8 @@ def clips_split(source: Path, out: Path, share: float, mirror: bool, seed: int) 
     """
     from kinetok.motion.library import ClipLibrary
 
+    if not source.is_dir() and source.suffix != ".safetensors":
+        raise ValueError(f"{source} is no clip library; make one: kinetok clips import {source} --out F.safetensors")
     library = ClipLibrary.open(source, mirror=mirror)
     for name, part in zip(("train", "held_out"), library.split(share, seed), strict=True):
         ClipLibrary.write(out / f"{name}.safetensors", (part.clip(index) for index in range(len(part))))
@@ -255,14 +270,20 @@ def clips_split(source: Path, out: Path, share: float, mirror: bool, seed: int) 
 @click.argument("source", type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
 @click.option("--name", default=None, help="Which clip of a library; default its only one.")
-@click.option("--seconds", default=60.0, show_default=True, help="Length of the motion.")
-@click.option("--turn", default=60.0, show_default=True, help="Degrees per second it turns at most, to either side.")
-@click.option("--tempo", default=1.2, show_default=True, help="How many times as fast or as slow it plays at most.")
-@click.option("--halt", default=0.0, show_default=True, help="Seconds between two halts on average; 0 for none.")
+@click.option("--seconds", default=60.0, show_default=True, type=SECONDS, help="Length of the motion.")
+@click.option("--turn", default=60.0, show_default=True, type=Number(0, 720), help="Degrees per second at most.")
+@click.option("--tempo", default=1.2, show_default=True, type=Number(1, 5), help="Times as fast or slow at most.")
+@click.option(
+    "--halt",
+    default=0.0,
+    show_default=True,
+    type=Number(0, DAY),
+    help="Seconds between two halts on average; 0 for none.",
+)
 @click.option("--into", default=None, help="A gait to go over into and back, in step: a file, or `stand`.")
 @click.option("--change", default=3.0, show_default=True, help="Seconds from one share of that gait to the next.")
-@click.option("--style", default=0.0, show_default=True, help="How much each motion differs from the walker's own way.")
-@click.option("--count", default=1, show_default=True, help="Motions to make, of seeds that follow one another.")
+@click.option("--style", default=0.0, show_default=True, type=Number(0, 5), help="How far from the walker's own way.")
+@click.option("--count", default=1, show_default=True, type=COUNT, help="Motions to make, of seeds one after another.")
 @option_seed
 def clips_vary(
     source: Path, out: Path, name: str | None, seconds, turn, tempo, halt, into: str | None, change, style, count, seed
@@ -291,6 +312,8 @@ def clips_vary(
             gait = restyle(clip, amount=style, seed=drawn)
             into_gait = restyle(other, amount=style, seed=drawn) if other else None
         varied.append(vary(gait, into=into_gait, seed=drawn, **told))
+    if not clip.loop and varied[0].seconds < seconds - 0.1:
+        say(f"{clip.name} is no loop: gone through once, {varied[0].seconds:.1f} s of the {seconds:g} asked for")
     if count > 1:
         varied = [replace(motion, name=f"{motion.name}-{number}") for number, motion in enumerate(varied, 1)]
     write_motion(out, *varied)
@@ -316,7 +339,7 @@ def clips_export(source: Path, out: Path, name: str | None) -> None:
 @click.argument("source", type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="Video to write, ending in .mp4 or .gif.")
 @click.option("--name", default=None, help="Which clip of a library; default its only one.")
-@click.option("--seconds", type=float, default=None, help="How much of it; default all, a loop three times.")
+@click.option("--seconds", type=SECONDS, default=None, help="How much of it; default all, a loop three times.")
 def clips_play(source: Path, out: Path, name: str | None, seconds: float | None) -> None:
     """Render a motion file to a video, as it was recorded and without physics."""
     from dataclasses import replace
@@ -325,7 +348,10 @@ def clips_play(source: Path, out: Path, name: str | None, seconds: float | None)
 
     check_suffix(out, *VIDEOS)
     clip = one_clip(source, name)
-    seconds = seconds or clip.seconds * (3 if clip.loop else 1)
+    seconds = clip.seconds * (3 if clip.loop else 1) if seconds is None else seconds
+    if not clip.loop and seconds > clip.seconds:
+        say(f"{clip.name} is no loop and ends after {clip.seconds:.2f} s, so does the video")
+        seconds = clip.seconds
     qpos = clip.at(np.arange(0, seconds, 1 / 30))
     write_motion(out, replace(clip, qpos=qpos, fps=30.0, loop=False), caption=clip.name)
 

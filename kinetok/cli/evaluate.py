@@ -3,12 +3,18 @@
 import click
 
 from kinetok.cli.shared import (
+    COUNT,
     PATHS,
+    POSITIVE,
+    PUSH,
+    SECONDS,
+    SHARE,
     TASK_NAMES,
     Chain,
     load_clips,
     option_device,
     option_hours,
+    option_json,
     option_seed,
     option_threads,
     show_json,
@@ -24,9 +30,9 @@ def evaluate() -> None:
 @click.option("--tokenizer", default="humanoid-fsq", show_default=True, type=PATHS, help="Directory or packaged name.")
 @click.option("--clips", "paths", multiple=True, required=True, type=PATHS, help="Motion file, library or folder.")
 @option_hours
-@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
-@click.option("--episodes", default=8, show_default=True, help="Per clip, from phases spread over it.")
-@click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@option_json
+@click.option("--episodes", default=8, show_default=True, type=COUNT, help="Per clip, from phases spread over it.")
+@click.option("--push", default=0.0, type=PUSH, help="Push the root every two seconds by so many m/s.")
 @click.option(
     "--from-start",
     is_flag=True,
@@ -58,11 +64,13 @@ def evaluate_tracking(tokenizer, paths, hours, out, episodes, push, from_start, 
 @evaluate.command("prior")
 @click.option("--prior", default="humanoid-gpt", show_default=True, type=PATHS, help="Directory or packaged name.")
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
-@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
-@click.option("--episodes", default=64, show_default=True, help="Motions to sample.")
-@click.option("--seconds", default=20.0, show_default=True, help="Length of each; who has fallen may get up.")
-@click.option("--push", default=0.0, help="Push every character once, at step 200, by so many m/s.")
-@click.option("--top-p", default=0.9, show_default=True, help="Nucleus of the next-token distribution.")
+@option_json
+@click.option("--episodes", default=64, show_default=True, type=COUNT, help="Motions to sample.")
+@click.option(
+    "--seconds", default=20.0, show_default=True, type=SECONDS, help="Length of each; who has fallen may get up."
+)
+@click.option("--push", default=0.0, type=PUSH, help="Push every character once, at step 200, by so many m/s.")
+@click.option("--top-p", default=0.9, show_default=True, type=SHARE, help="Nucleus of the next-token distribution.")
 @option_threads
 @option_device
 @option_seed
@@ -82,14 +90,16 @@ def evaluate_prior(prior, tokenizer, out, episodes, seconds, push, top_p, thread
 )
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--task", default=None, metavar=TASK_NAMES, help="What to do.  [default: the skill's own; alone: target]")
-@click.option("--json", "out", default=None, type=PATHS, help="Write the result here instead of printing it.")
-@click.option("--episodes", default=256, show_default=True, help="Characters, each for --seconds.")
-@click.option("--seconds", default=20.0, show_default=True, help="Length of each; a target comes every 6 to 8 s.")
-@click.option("--push", default=0.0, help="Push the root every two seconds by so many m/s.")
+@option_json
+@click.option("--episodes", default=256, show_default=True, type=COUNT, help="Characters, each for --seconds.")
 @click.option(
-    "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: the skill's own; alone: 0.9]"
+    "--seconds", default=20.0, show_default=True, type=SECONDS, help="Length of each; a target comes every 6 to 8 s."
 )
-@click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
+@click.option("--push", default=0.0, type=PUSH, help="Push the root every two seconds by so many m/s.")
+@click.option(
+    "--top-p", default=None, type=SHARE, help="Nucleus of the next tokens.  [default: the skill's own; alone: 0.9]"
+)
+@click.option("--temperature", default=None, type=POSITIVE, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
 @option_threads
 @option_device
 @option_seed

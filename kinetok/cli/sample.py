@@ -1,10 +1,24 @@
 """New motion: `kinetok sample`, of a prior or of a skill."""
 
+import json
 from pathlib import Path
 
 import click
 
-from kinetok.cli.shared import PATHS, VIDEOS, check_suffix, option_device, option_seed, show_json, write_motion
+from kinetok.cli.shared import (
+    COUNT,
+    PATHS,
+    POSITIVE,
+    PUSH,
+    SECONDS,
+    SHARE,
+    VIDEOS,
+    check_suffix,
+    option_device,
+    option_seed,
+    show_json,
+    write_motion,
+)
 
 
 @click.command()
@@ -12,13 +26,17 @@ from kinetok.cli.shared import PATHS, VIDEOS, check_suffix, option_device, optio
 @click.option("--adapter", default=None, type=PATHS, help="A fine-tuned skill to play instead of the prior alone.")
 @click.option("--tokenizer", default=None, type=PATHS, help="Where its tokenizer is, if not where it was trained.")
 @click.option("--out", required=True, type=PATHS, help="Video to write (.mp4, .gif); motion and metrics go beside it.")
-@click.option("--seconds", default=10.0, show_default=True, help="Length of the motion.")
+@click.option("--seconds", default=10.0, show_default=True, type=SECONDS, help="Length of the motion.")
 @click.option(
-    "--top-p", default=None, type=float, help="Nucleus of the next tokens.  [default: 0.9, or the skill's own]"
+    "--top-p", default=None, type=SHARE, help="Nucleus of the next tokens.  [default: 0.9, or the skill's own]"
 )
-@click.option("--temperature", default=None, type=float, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
-@click.option("--count", default=1, show_default=True, help="Characters; each becomes a clip, the first the video.")
-@click.option("--push", default=0.0, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds.")
+@click.option("--temperature", default=None, type=POSITIVE, help="Above 1 is bolder, below 1 more usual.  [default: 1]")
+@click.option(
+    "--count", default=1, show_default=True, type=COUNT, help="Characters; each becomes a clip, the first the video."
+)
+@click.option(
+    "--push", default=0.0, type=PUSH, help="Push the character, in m/s: at 6.7 s, with --adapter every two seconds."
+)
 @option_seed
 @option_device
 def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, push, seed) -> None:
@@ -28,6 +46,7 @@ def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, p
     temperature are those it was trained with, unless you say otherwise.
     """
     check_suffix(out, *VIDEOS)
+    _refuse_another_motion(out)
     drawn = {name: value for name, value in (("top_p", top_p), ("temperature", temperature)) if value is not None}
     if adapter is not None:
         return sample_skill(adapter, prior, tokenizer, out, drawn, seconds=seconds, count=count, push=push, seed=seed)
@@ -50,6 +69,21 @@ def sample(prior, adapter, tokenizer, out, seconds, top_p, temperature, count, p
     show_json(measure(recording) | {"seed": seed, "prior": str(prior), **drawn}, out.with_suffix(".json"))
 
 
+def _refuse_another_motion(out: Path) -> None:
+    """Refuse where the clips would go over a library that no earlier `sample` has written: it has no figures."""
+    clips, figures = out.with_suffix(".safetensors"), out.with_suffix(".json")
+    try:
+        known = "seed" in json.loads(figures.read_text()) if figures.exists() else not clips.exists()
+    except (OSError, ValueError):
+        known = False
+    if not known:
+        there = clips if clips.exists() else figures
+        raise ValueError(
+            f"--out {out}: its motion goes to {clips} and its figures to {figures}, and {there} is another file; "
+            "choose another name"
+        )
+
+
 def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, count, push, seed) -> None:
     """`sample --adapter`: the first character's video with markers, every character's clip, and the scores.
 
@@ -69,13 +103,13 @@ def sample_skill(adapter, prior, tokenizer, out: Path, drawn: dict, *, seconds, 
         skill.controller(seed), skill.task, skill.prior,
         episodes=count, seconds=seconds, push=push, seed=seed, record=count,
     )  # fmt: skip
-    body, name = skill.prior.character, skill.task.kind
+    body, name, character = skill.prior.character, skill.task.kind, skill.prior.tokenizer.config.character
     frames = render_task(body, played.qpos[:, 0], played.markers, fps=played.fps, caption=name)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_video(out, frames, played.fps)
     click.echo(f"wrote {out}: {len(played.qpos)} frames at {played.fps:g} fps")
     motion = [
-        Clip(name=f"{name}{i}", character=body.name, fps=played.fps, qpos=played.qpos[:, i], source=str(adapter))
+        Clip(name=f"{name}{i}", character=character, fps=played.fps, qpos=played.qpos[:, i], source=str(adapter))
         for i in range(count)
     ]
     write_motion(out.with_suffix(".safetensors"), *motion)

@@ -1,5 +1,6 @@
 """What the commands share: options, the group that says errors in one line, reading clips and writing motion."""
 
+import functools
 import json
 import os
 from pathlib import Path
@@ -19,15 +20,33 @@ class Chain(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except Exception as error:
-            from kinetok.checkpoint import CheckpointError
-
-            expected = (ValueError, CheckpointError, OSError, FloatingPointError, ImportError)
-            if os.environ.get("KINETOK_TRACEBACK") or not isinstance(error, expected):
+            known = isinstance(error, (ValueError, OSError, FloatingPointError, ImportError, MemoryError))
+            known |= type(error).__module__.startswith("kinetok.")
+            if os.environ.get("KINETOK_TRACEBACK") or not known:
                 raise
-            raise click.ClickException(str(error)) from error
+            short = "not enough memory for that: " if isinstance(error, MemoryError) else ""
+            raise click.ClickException(short + str(error)) from error
 
 
 NATURAL = click.IntRange(min=0)
+COUNT = click.IntRange(min=1)
+
+
+class Number(click.FloatRange):
+    """A range that `nan` is not in."""
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if number != number:
+            self.fail(f"{value!r} is not a number", param, ctx)
+        return number
+
+
+DAY = 86_400
+SECONDS = Number(min=0, max=DAY, min_open=True)
+PUSH = Number(min=0, max=100)
+SHARE = Number(min=0, max=1, min_open=True)
+POSITIVE = Number(min=0, max=1000, min_open=True)
 option_seed = click.option(
     "--seed", default=0, show_default=True, type=NATURAL, help="Seeds weights, worlds and noise; the same repeats it."
 )
@@ -74,11 +93,30 @@ option_device = click.option(
 )
 
 
+def _told_where_it_goes_on(command):
+    """Say, of a training that is stopped by Ctrl-C, how it goes on."""
+
+    @functools.wraps(command)
+    def told(*args, **kwargs):
+        try:
+            return command(*args, **kwargs)
+        except KeyboardInterrupt:
+            out = kwargs.get("out")
+            kept = out is not None and any(Path(out).rglob("state*.safetensors"))
+            raise click.ClickException(
+                f"stopped; the same command goes on from the last state in {out}"
+                if kept
+                else "stopped before its first state was written; the same command begins anew"
+            ) from None
+
+    return told
+
+
 def configured(presets: str):
     """--preset, --set, --seed, --threads and --device, the same on every training command."""
 
     def decorate(command):
-        command = option_seed(option_threads(option_device(command)))
+        command = option_seed(option_threads(option_device(_told_where_it_goes_on(command))))
         command = click.option(
             "--set",
             "settings",
@@ -128,15 +166,40 @@ def check_suffix(out: Path, *allowed: str) -> None:
 
 
 def show_json(data: dict, out: Path | None) -> None:
+    """Print it, or write it to a file; where that fails it is printed all the same."""
     text = json.dumps(data, indent=1)
     if out is None:
         click.echo(text)
         return
-    out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.tmp")
-    temporary.write_text(text + "\n")
-    temporary.replace(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(text + "\n")
+        temporary.replace(out)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        click.echo(text)
+        raise ValueError(f"{out} could not be written ({error}); what it would hold is printed above") from error
     click.echo(f"wrote {out}")
+
+
+def writable(_: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
+    """Callback of an option that names a file to write: refuse a folder, and a place where nothing can be written,
+    before any work is done for it."""
+    if path is None:
+        return None
+    if path.is_dir():
+        raise click.BadParameter(f"{path} is a folder; give a file")
+    there = next(parent for parent in path.absolute().parents if parent.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise click.BadParameter(f"nothing can be written to {there}; choose another place")
+    return path
+
+
+option_json = click.option(
+    "--json", "out", default=None, type=click.Path(path_type=Path), callback=writable,
+    help="Write the result here instead of printing it.",
+)  # fmt: skip
 
 
 PATHS = click.Path(path_type=Path)
@@ -157,6 +220,10 @@ def one_clip(source: Path, name: str | None):
         raise ValueError(f"{source} holds {len(names)} clips; choose one with --name: {', '.join(names[:12])}")
     if name is not None and name not in names:
         raise ValueError(f"{source} holds no clip {name!r}{nearest(name, names)}")
+    if name is not None and names.count(name) > 1:
+        raise ValueError(
+            f"{source} holds {names.count(name)} clips named {name!r}; import them anew to tell them apart"
+        )
     index = names.index(name) if name else 0
     return library.clip(index) if library is not None else found[index]
 

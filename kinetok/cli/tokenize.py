@@ -5,6 +5,7 @@ import click
 from kinetok.cli.shared import (
     EXPORTS,
     PATHS,
+    SECONDS,
     VIDEOS,
     Chain,
     check_suffix,
@@ -12,6 +13,7 @@ from kinetok.cli.shared import (
     load_clips,
     one_clip,
     option_hours,
+    say,
     write_motion,
 )
 
@@ -58,16 +60,23 @@ def tokenize_fit(paths, hours, out, stages, preset, settings, threads, seed) -> 
 @click.option("--tokenizer", required=True, type=PATHS, help="Artifact directory or packaged name.")
 @click.option("--out", required=True, type=PATHS, help="Token file to write, ending in .safetensors.")
 @click.option("--name", default=None, help="Which clip of a library; default its only one.")
-@click.option("--seconds", type=float, default=None, help="How long to track; default once through the clip.")
+@click.option("--seconds", type=SECONDS, default=None, help="How long to track; default once through the clip.")
 def tokenize_encode(clip, tokenizer, out, name, seconds) -> None:
     """Write the tokens of a clip: (T, S) int64, one row per control step, with their layout."""
     from kinetok.tokenizers.codec import encode_clip
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
     check_suffix(out, ".safetensors")
-    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), one_clip(clip, name), seconds=seconds)
+    motion = one_clip(clip, name)
+    stream = encode_clip(MotionTokenizer.from_pretrained(tokenizer), motion, seconds=seconds)
     stream.save(out)
-    click.echo(f"wrote {out}: tokens {tuple(stream.tokens.shape)}, {stream.layout}")
+    steps, positions = stream.tokens.shape
+    click.echo(f"wrote {out}: {steps} control steps of {positions} tokens, from {stream.layout.vocabulary} each")
+    if stream.lost:
+        say(
+            f"{motion.name}: the track was lost after {steps / stream.fps:.1f} s, and the tokens end there. `kinetok "
+            "evaluate tracking` tells what this tokenizer follows; `kinetok tokenize fit` teaches one this motion"
+        )
 
 
 @tokenize.command("decode")
@@ -81,6 +90,8 @@ def tokenize_decode(tokens, tokenizer, out) -> None:
     from kinetok.tokenizers.tokenizer import MotionTokenizer
 
     check_suffix(out, ".safetensors", *VIDEOS, *EXPORTS)
+    if out.exists() and out.resolve() == tokens.resolve():
+        raise ValueError(f"--out {out} holds the tokens themselves; choose another name")
     stream = TokenStream.load(tokens)
     model = MotionTokenizer.from_pretrained(tokenizer)
     qpos, character = decode_tokens(model, stream), model.config.character

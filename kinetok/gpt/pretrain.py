@@ -23,8 +23,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kinetok.checkpoint import Artifact, CheckpointError, load_artifact
-from kinetok.config import ConfigError, diff, from_dict, to_dict
+from kinetok.checkpoint import Artifact, CheckpointError, load_artifact, refuse_foreign
+from kinetok.config import ConfigError, at_least, diff, from_dict, to_dict
 from kinetok.gpt.controller import Prior, gpt_weights, noted_path
 from kinetok.gpt.data import TokenDataset, record
 from kinetok.gpt.model import GPT, GPTConfig
@@ -39,7 +39,7 @@ from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.roaming import REACH
 from kinetok.sim.tasks.tracking import ReferenceTable
 from kinetok.tokenizers.layout import TokenLayout
-from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.tokenizer import MotionTokenizer, require_character
 
 THREADS = 2  # of torch, where none are asked for: one number everywhere keeps results the same everywhere
 EVAL_SAMPLES = 8192
@@ -90,6 +90,10 @@ class PretrainConfig:
     refine: RefineConfig = RefineConfig(rounds=0)
     start: str = ""
 
+    def __post_init__(self) -> None:
+        counts = ("samples", "rows", "iterations", "batch", "eval_every")
+        at_least(self, 1, dict.fromkeys(counts, "without, nothing is learned"))
+
     def gpt(self, layout: TokenLayout, state_dim: int) -> GPTConfig:
         """The shape of the GPT for these tokens and states."""
         return GPTConfig(
@@ -130,12 +134,14 @@ def pretrain(
             "this tokenizer has no hash; save it, then load it with MotionTokenizer.from_pretrained(path)"
         )
     library = ClipLibrary.of(clips)
+    require_character(library, tokenizer.config.character)
     identity = {
         "tokenizer": tokenizer.hash,
         "seed": seed,
     } | library.identity()
     shape = config.gpt(tokenizer.layout, tokenizer.sizes["state"])
     start = _start(config.start, shape) if config.start else None
+    refuse_foreign(out, "prior")
     out.mkdir(parents=True, exist_ok=True)
     data = _recorded(tokenizer, library, config, out / "tokens.safetensors", identity, threads=threads, quiet=quiet)
     torch.manual_seed(seed)
@@ -357,7 +363,7 @@ def prior_card(prior: Prior, config: PretrainConfig, data: TokenDataset, metrics
     )
     refined = (
         f"round {metrics['round'] + 1:.0f} of {config.refine.rounds}, survival {metrics['survival']:.0%} of "
-        f"{config.refine.episodes} episodes of 20 s"
+        f"{config.refine.episodes} episodes of {config.refine.survive:g} s"
         if "round" in metrics
         else "no"
     )

@@ -95,6 +95,12 @@ def refine(
             states, tokens, fell = play(playing, config, generator, seed=seed + number, threads=threads)
             memory = [*memory, (states, tokens)][-config.memory :]
             own = tuple(torch.cat(parts) for parts in zip(*memory, strict=True))
+            if not len(own[0]):
+                raise ValueError(
+                    f"round {number} of refining: of {config.rows} roll-outs of {config.seconds:g} s none stayed up "
+                    "long enough to learn from; see by `kinetok evaluate tracking` whether the tokenizer follows these "
+                    "clips, or leave refining out: --set refine.rounds=0"
+                )
             for iteration in range(config.iterations):
                 loss = _learn(gpt, average, optimizer, data, own, config, generator)
                 step = number * config.iterations + iteration

@@ -27,13 +27,14 @@ from kinetok.sim.observe import state_features
 from kinetok.sim.scene import build_scene
 from kinetok.sim.tasks.tracking import Failure, ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.layout import TokenLayout
-from kinetok.tokenizers.tokenizer import MotionTokenizer
+from kinetok.tokenizers.tokenizer import MotionTokenizer, require_character
 
 
 @dataclass(frozen=True, kw_only=True)
 class TokenStream:
     """tokens (T, S) int64; layout; qpos (nq,), qvel (nv,): the state before the first token; fps: control rate;
-    name of the clip; tokenizer: hash of the artifact that wrote it; simulated (T + 1, nq): the poses it reached."""
+    name of the clip; tokenizer: hash of the artifact that wrote it; simulated (T + 1, nq): the poses it reached; lost:
+    whether it ends where the track was lost."""
 
     tokens: Tensor
     layout: TokenLayout
@@ -43,6 +44,7 @@ class TokenStream:
     name: str
     tokenizer: str
     simulated: np.ndarray
+    lost: bool = False
 
     def save(self, path: Path | str) -> None:
         """Write one safetensors file, whole or not at all."""
@@ -51,7 +53,7 @@ class TokenStream:
         for name in ("qpos", "qvel", "simulated"):
             tensors[name] = torch.from_numpy(np.ascontiguousarray(getattr(self, name)))
         meta = {"kind": "tokens", "layout": to_dict(self.layout), "fps": self.fps, "name": self.name}
-        save_state(path, tensors, meta | {"tokenizer": self.tokenizer})
+        save_state(path, tensors, meta | {"tokenizer": self.tokenizer, "lost": self.lost})
 
     @staticmethod
     def load(path: Path | str) -> "TokenStream":
@@ -67,28 +69,29 @@ class TokenStream:
             fps=meta["fps"],
             name=meta["name"],
             tokenizer=meta["tokenizer"],
+            lost=meta.get("lost", False),
             **arrays,
         )
 
 
-def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None = None, seed: int = 0) -> TokenStream:
+def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None = None) -> TokenStream:
     """Track the clip from its first frame for `seconds` (default: once through) and write down the tokens.
 
     Raises ConfigError where the clip is of another character; a track that is lost ends the stream there.
     """
     config = tokenizer.config
-    if clip.character != config.character:
-        raise ConfigError(f"clip {clip.name!r} is of {clip.character!r}, the tokenizer of {config.character!r}")
+    library = ClipLibrary.of([clip])
+    require_character(library, config.character)
     layout = tokenizer.layout
     seconds = clip.seconds if seconds is None else seconds
     if not seconds * config.scene.control_hz >= 1 - 1e-6:
         raise ValueError(
             f"{seconds:g} seconds of clip {clip.name!r} hold no control step of 1/{config.scene.control_hz} s"
         )
-    table = ReferenceTable(ClipLibrary.of([clip]), control_hz=config.scene.control_hz, seconds=seconds + 1)
+    table = ReferenceTable(library, control_hz=config.scene.control_hz, seconds=seconds + 1)
     tracking = TrackingConfig(future=config.future, failure=Failure(largest=np.inf, mean=0.5))
     task = Tracking(tracking, table, rows=1, starts=np.zeros(1, dtype=int))
-    env = Env(EnvConfig(scene=config.scene, autoreset=False), task, rows=1, threads=1, seed=seed)
+    env = Env(EnvConfig(scene=config.scene, autoreset=False), task, rows=1, threads=1)
     obs = torch.as_tensor(env.reset())
     first = env.sim.qpos[0].copy(), env.sim.qvel[0].copy()
     tokens, simulated = [], [first[0]]
@@ -111,6 +114,7 @@ def encode_clip(tokenizer: MotionTokenizer, clip: Clip, *, seconds: float | None
         name=clip.name,
         tokenizer=tokenizer.hash,
         simulated=np.array(simulated),
+        lost=bool(step.terminated[0]),
     )
 
 

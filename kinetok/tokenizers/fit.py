@@ -27,7 +27,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from kinetok.checkpoint import load_artifact, load_state, locate, refuse_foreign, save_artifact
+from kinetok.checkpoint import CheckpointError, load_artifact, load_state, locate, refuse_foreign, save_artifact
 from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
 from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
@@ -158,7 +158,8 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     if student.quantizer.levels:
         student.layout  # noqa: B018  refuses codes that do not divide into tokens, before hours of training
     teachers = _teachers(config, config.teachers, names) if config.teachers and "distill" in config.stages else []
-    refuse_foreign(out)
+    refuse_foreign(out, "tokenizer")
+    _refuse_other_clips(out, table)
     out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     stories: dict[str, str] = {}
@@ -203,6 +204,18 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
     ranks.first(lambda: _publish(out, stories, config, table, taught, started, seed=seed, threads=threads))
     return MotionTokenizer.from_pretrained(out)
+
+
+def _refuse_other_clips(out: Path, table: ReferenceTable) -> None:
+    """Refuse a run of other clips before its first stage, which would add to it what a later one then refuses."""
+    for stage in ("distill", "ppo"):
+        if (path := out / stage / "state.safetensors").exists():
+            before = load_state(path)[1].get("identity", {})
+            if changed := diff({key: before.get(key) for key in table.identity}, table.identity):
+                raise CheckpointError(
+                    f"{path}: this run is of other clips: {'; '.join(changed)}. "
+                    "Give the same clips to go on, or choose another --out"
+                )
 
 
 def _publish(

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from kinetok.checkpoint import load_artifact, save_artifact
 from kinetok.config import ConfigError, from_dict, to_dict
+from kinetok.motion.library import ClipLibrary
 from kinetok.rl.nets import mlp
 from kinetok.rl.normalize import RunningNorm
 from kinetok.sim.scene import SceneConfig
@@ -53,6 +54,9 @@ class TokenizerConfig:
         for part in (*self.encoder_inputs, *self.decoder_inputs):
             if part not in PARTS:
                 raise ConfigError(f"unknown observation part {part!r}; parts: {', '.join(PARTS)}")
+        for name in ("encoder", "decoder"):
+            if any(width < 1 for width in getattr(self, name)):
+                raise ConfigError(f"{name} holds widths of layers, of at least 1 each, not {getattr(self, name)}")
         if self.quantizer.kind == "continuous":
             return
         if self.residual or self.decoder_inputs != ("state",):
@@ -149,3 +153,12 @@ class MotionTokenizer(nn.Module):
         tokenizer.load_state_dict(artifact.tensors)
         tokenizer.hash = artifact.hash
         return tokenizer.eval()
+
+
+def require_character(library: ClipLibrary, character: str) -> None:
+    """Refuse clips of another character than a tokenizer's."""
+    if library.character != character:
+        raise ConfigError(
+            f"clip {library.names[0]!r} is of {library.character!r}, the tokenizer of {character!r}; retarget it "
+            f"first: kinetok clips import --character {character}"
+        )

@@ -185,7 +185,7 @@ def test_another_base_is_refused_by_both_hashes(tmp_path):
 
 def test_what_is_not_an_adapter_is_refused(tmp_path):
     save_artifact(tmp_path / "prior", kind="prior", config={}, tensors={"w": torch.ones(2)}, card="#")
-    with pytest.raises(CheckpointError, match=r"prior holds a README\.md that kinetok did not write"):
+    with pytest.raises(CheckpointError, match=r"holds a 'prior', which a 'adapter' would replace"):
         bend("lora").save_pretrained(tmp_path / "prior", base="prior")  # would overwrite the prior's card
     with pytest.raises(CheckpointError, match=r"has no adapter_config\.json"):
         Adapted.from_pretrained(tmp_path / "prior", build())

@@ -355,7 +355,7 @@ def test_a_foreign_place_is_left_alone(models, plain, tmp_path):
     before = contents(tmp_path)
     for out, message in (
         (tmp_path, "holds a README.md that kinetok did not write"),
-        (tmp_path / "prior", "holds a README.md"),
+        (tmp_path / "prior", "holds a 'prior', which a 'adapter' would replace"),
         (tmp_path / "file", "is a file; an artifact is a directory"),
     ):
         with pytest.raises(CheckpointError, match=message):

@@ -30,7 +30,7 @@ def run(clip, tmp_path_factory) -> Path:
 def tokens(run, clip, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("tokens") / "wave.safetensors"
     result = kinetok("tokenize", "encode", clip, "--tokenizer", run, "--out", out)
-    assert result.exit_code == 0 and f"wrote {out}: tokens (15, 2)" in result.output
+    assert result.exit_code == 0 and f"wrote {out}: 15 control steps of 2 tokens" in result.output
     return out
 
 

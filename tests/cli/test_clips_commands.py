@@ -48,6 +48,15 @@ def test_a_library_grows_and_is_parted(clip, tmp_path):
     assert wrong.exit_code == 1 and "between 0 and 1" in wrong.output and not (tmp_path / "none").exists()
 
 
+def test_files_of_one_name_are_told_apart(clip, tmp_path):
+    more = [write_clip(tmp_path / folder / clip.name, frames(11)) for folder in ("a", "b")]
+    out = tmp_path / "all.safetensors"
+    told = kinetok("clips", "import", clip, more[0], "--out", out)
+    assert told.exit_code == 0 and "another clip is called wave, so this one is wave-2" in told.output
+    assert kinetok("clips", "import", more[1], "--append", "--out", out).exit_code == 0
+    assert [c.name for c in read_clips(out)] == ["wave", "wave-2", "wave-3"]
+
+
 def test_what_is_refused_can_be_left_out(clip, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "broken.bvh").write_text("HIERARCHY\nROOT hip\n")

@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from kinetok.checkpoint import load_artifact, save_artifact
+from kinetok.motion.character import Character
+from kinetok.motion.clip import Clip
+from kinetok.motion.library import ClipLibrary
 from tests.cli.typed import FIT, frames, kinetok, write_clip
 
 
@@ -77,13 +81,30 @@ WRONG = {
         lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", "humanoid-fsk"),
         "there is no directory humanoid-fsk",
     ),
-    "encode no time": (
-        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", r, "--seconds", 0),
-        "0 seconds of clip 'wave' hold no control step",
+    "encode less than a control step": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", r, "--seconds", 0.01),
+        "0.01 seconds of clip 'wave' hold no control step",
     ),
     "decode a clip": (
         lambda p, c, r, t: ("tokenize", "decode", c, "--tokenizer", r),
         "humanoid3d_wave.txt is not a safetensors file",
+    ),
+    "pretrain on clips of another body": (
+        lambda p, c, r, t: ("pretrain", "--tokenizer", r, "--clips", robot(p), "--preset", "tiny"),
+        "clip 'robot' is of 'g1', the tokenizer of 'humanoid'; retarget it first: kinetok clips import --character",
+    ),
+    "a packaged skill as tokenizer": (
+        lambda p, c, r, t: ("tokenize", "encode", c, "--tokenizer", "humanoid-target"),
+        "the packaged humanoid-target is a 'adapter'; of the kind asked for: humanoid-fsq",
+    ),
+    "split what is no library": (lambda p, c, r, t: ("clips", "split", c), "is no clip library; make one: kinetok"),
+    "no iterations": (
+        lambda p, c, r, t: ("pretrain", "--tokenizer", r, "--clips", c, "--preset", "tiny", "--set", "batch=0"),
+        "batch must be at least 1, not 0",
+    ),
+    "a layer of no width": (
+        lambda p, c, r, t: (*FIT, c, "--set", "tokenizer.encoder=[-1]"),
+        "encoder holds widths of layers, of at least 1 each, not (-1,)",
     ),
     "decode by another tokenizer": (
         lambda p, c, r, t: ("tokenize", "decode", t, "--tokenizer", r / ("ppo" if same(r, "distill") else "distill")),
@@ -91,6 +112,13 @@ WRONG = {
     ),
     "import nothing": (lambda p, c, r, t: ("clips", "import", p / "no.txt"), "no.txt: file: does not exist"),
 }
+
+
+def robot(folder: Path) -> Path:
+    """A library of one standing G1."""
+    stand = np.tile(Character.load("g1").stand(), (30, 1))
+    ClipLibrary.write(folder / "g1.safetensors", [Clip(name="robot", character="g1", fps=30.0, qpos=stand)])
+    return folder / "g1.safetensors"
 
 
 @pytest.mark.parametrize(("args", "message"), WRONG.values(), ids=WRONG)
@@ -178,6 +206,55 @@ def test_the_suffix_is_judged_before_any_work(words, allowed, tmp_path):
     result = kinetok(*words, "--out", tmp_path / "out.txt")
     assert result.exit_code == 1
     assert result.output == f"Error: --out {tmp_path / 'out.txt'}: the name must end in {allowed}\n"
+
+
+def test_numbers_out_of_range_are_refused_by_their_option(clip, run):
+    for words, option in (
+        (("evaluate", "tracking", "--tokenizer", run, "--clips", clip, "--episodes", 0), "--episodes"),
+        (("evaluate", "prior", "--seconds", 0), "--seconds"),
+        (("evaluate", "task", "--push", "nan"), "--push"),
+        (("sample", "--out", "x.mp4", "--seconds", 1e9), "--seconds"),
+        (("sample", "--out", "x.mp4", "--temperature", -1), "--temperature"),
+        (("clips", "vary", clip, "--out", "x.safetensors", "--count", 0), "--count"),
+    ):
+        result = kinetok(*words)
+        assert result.exit_code == 2 and f"Invalid value for '{option}'" in result.output, words
+
+
+def test_where_a_result_cannot_be_written_is_said_before_it_is_made(clip, run, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path, tmp_path / "file" / "out.json"):
+        result = kinetok("evaluate", "tracking", "--tokenizer", run, "--clips", clip, "--json", place)
+        assert result.exit_code == 2 and "Invalid value for '--json'" in result.output
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_nothing_is_written_over_what_is_something_else(clip, run, prior, tokens, tmp_path):
+    before = load_artifact(run).hash
+    result = kinetok("pretrain", "--tokenizer", run, "--clips", clip, "--preset", "tiny", "--out", run)
+    assert result.exit_code == 1 and "holds a 'tokenizer', which a 'prior' would replace" in result.output
+    result = kinetok("finetune", "--preset", "tiny", "--prior", prior, "--out", run)
+    assert result.exit_code == 1 and "holds a 'tokenizer', which a 'adapter' would replace" in result.output
+    assert load_artifact(run).hash == before
+    kept = tokens.read_bytes()
+    result = kinetok("tokenize", "decode", tokens, "--tokenizer", run, "--out", tokens)
+    assert result.exit_code == 1 and "holds the tokens themselves" in result.output
+    result = kinetok("sample", "--prior", prior, "--out", tokens.with_suffix(".mp4"), "--seconds", 1)
+    assert result.exit_code == 1 and f"{tokens} is another file; choose another name" in result.output
+    assert tokens.read_bytes() == kept
+
+
+def test_a_stopped_training_says_how_it_goes_on(clip, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kinetok.tokenizers.fit.fit", stop)
+    result = kinetok(*FIT, clip, "--out", tmp_path / "run")
+    assert result.exit_code == 1 and "stopped before its first state was written" in result.output
+    (tmp_path / "run" / "ppo").mkdir(parents=True)
+    (tmp_path / "run" / "ppo" / "state.safetensors").write_bytes(b"")
+    result = kinetok(*FIT, clip, "--out", tmp_path / "run")
+    assert result.exit_code == 1 and f"goes on from the last state in {tmp_path / 'run'}" in result.output
 
 
 def test_a_file_where_a_folder_should_be_is_one_line(clip, tmp_path):

@@ -74,7 +74,8 @@ def test_seconds_cut_a_clip_and_lengthen_a_loop(tokenizer, wave):
 def test_a_lost_track_ends_the_stream(tokenizer, wave):
     flight = wave("flight")
     flight.qpos[5:, 2] += 2.0
-    assert len(encode_clip(tokenizer, flight).tokens) == 5
+    lost = encode_clip(tokenizer, flight)
+    assert len(lost.tokens) == 5 and lost.lost and not encode_clip(tokenizer, wave("wave")).lost
 
 
 def test_file_round_trip(stream, tokenizer, tmp_path):

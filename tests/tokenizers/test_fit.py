@@ -319,10 +319,13 @@ def test_finished_teachers_are_not_passed_off_as_others(done, clips, small):
         fit(clips, changed, out)
 
 
-def test_other_motions_of_the_same_names_are_refused(done, clips, small):
+def test_other_motions_of_the_same_names_are_refused_before_a_teacher_of_them(done, wave, clips, small):
     out, _ = done
-    with pytest.raises(CheckpointError, match=r"frames: "):
+    with pytest.raises(CheckpointError, match=r"this run is of other clips: .*frames: "):
         fit([replace(clip, qpos=clip.qpos[:-1]) for clip in clips], small, out)
+    with pytest.raises(CheckpointError, match=r"this run is of other clips: clips: "):
+        fit([wave("third")], small, out)
+    assert not (out / "teachers" / "third").exists()
 
 
 def test_more_samples_take_a_finished_teacher_further(clips, small, tmp_path):

@@ -181,7 +181,8 @@ def _gated(path: Path, motion: Clip | SkeletonMotion, say: Callable[[str], None]
             raise FormatError(path, where, finding.message)
     loud = [f for f in findings if f.severity != "note" or (f.kind == "floor" and abs(f.value or 0) > FLOOR_WRONG)]
     if any(word in motion.source for word in SAID):
-        say(f"{motion.name}: {motion.source}")
+        hint = "; `kinetok clips import --fps` takes another" if "fps assumed" in motion.source else ""
+        say(f"{motion.name}: {motion.source}{hint}")
     for line in report(loud).splitlines()[:-1] if loud else ():
         # What is refused there and leaps by a joint alone is let in here.
         say(f"{motion.name}: {line.removeprefix('refused').strip()}")

@@ -166,7 +166,13 @@ def _place(path: Path, header: list[str]) -> dict[str, int]:
     names = {name.removesuffix("_dof").removesuffix("_joint"): index for index, name in enumerate(header)}
     missing = [name for name in (*TRANSLATE, *ROTATE, *JOINTS) if name not in names]
     if missing:
-        raise FormatError(path, "line 1", f"the header lacks {', '.join(missing[:5])}{', ...' * (len(missing) > 5)}")
+        lacks = f"the header lacks {', '.join(missing[:5])}{', ...' * (len(missing) > 5)}"
+        if len(missing) == len((*TRANSLATE, *ROTATE, *JOINTS)):
+            lacks = (
+                "neither numbers nor BONES-SEED's names; without a header a row is 36 numbers with commas between: "
+                "root x y z, quaternion, 29 joints (docs/formats.md)"
+            )
+        raise FormatError(path, "line 1", lacks)
     if len(names) != len(header):
         twice = next(name for name in header if header.count(name) > 1)
         raise FormatError(path, "line 1", f"two columns are named {twice!r}")

@@ -84,12 +84,11 @@ class ReferenceTable:
         counts = self.cycle + round(seconds * control_hz) * library.loop + 1
         self.first = np.cumsum(counts) - counts
         self.last = self.first + counts - 1
-        columns: dict[str, np.ndarray] = {}
+        few = _tabulated(self.character, library.clip(0), 2, control_hz)
+        _refuse_too_large(counts.sum(), sum(part[0].nbytes for part in few.values()), control_hz)
+        columns = {name: np.empty((counts.sum(), *part.shape[1:]), part.dtype) for name, part in few.items()}
         for index, (first, count) in enumerate(zip(self.first, counts, strict=True)):
             some = _tabulated(self.character, library.clip(index), int(count), control_hz)
-            if not columns:
-                _refuse_too_large(counts.sum(), sum(part[0].nbytes for part in some.values()), control_hz)
-                columns = {name: np.empty((counts.sum(), *part.shape[1:]), part.dtype) for name, part in some.items()}
             for name, part in some.items():
                 columns[name][first : first + count] = part
         body = ("pos", "mat", "linear", "angular", "quat")

@@ -108,7 +108,7 @@ def test_a_folder_gives_what_is_motion_and_passes_the_rest(tmp_path, squat, data
         ("walk.pkl", pickle.dumps({"a": 1}), "first bytes", "unknown format"),
         ("walk.bvh", b"", "file", "is empty"),
         ("walk.csv", b"", "file", "is empty"),
-        ("walk.csv", b"a,b\n1,2\n3,4\n", "line 1", "the header lacks root_translateX"),
+        ("walk.csv", b"a,b\n1,2\n3,4\n", "line 1", "neither numbers nor BONES-SEED's names"),
         ("walk.npy", b"\x93NUMPY", "header", "not an npy array"),
         ("walk.npz", b"PK\x03\x04", "archive", "damaged or cut off"),
         ("walk.motion", b"PK\x03\x04", "archive", "damaged or cut off"),
@@ -169,7 +169,7 @@ def test_what_has_one_right_repair_is_repaired_and_said(tmp_path, squat):
     (clip,) = read_clips(tmp_path / "high.csv", say=said.append)
     assert abs(clip.qpos[:, 2] - squat.clip().qpos[:, 2]).max() < 0.01
     assert said == [
-        "high: high.csv (lafan1 by the ground, 30 fps assumed)",
+        "high: high.csv (lafan1 by the ground, 30 fps assumed); `kinetok clips import --fps` takes another",
         "high: fixed   floor    the feet stand +0.200 m over the floor all the time; shifted onto it",
     ]
     ClipLibrary.write(tmp_path / "own.safetensors", [raised])  # has been through it, or is meant so

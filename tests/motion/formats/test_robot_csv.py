@@ -110,8 +110,8 @@ def cell(rows: list[str], row: int, column: int, text: str) -> list[str]:
         (lambda rows: cell(rows, 4, 9, "1e999"), "row, column [4, 9]", "inf is not a finite number"),
         (lambda rows: cell(rows, 4, 6, "9"), "columns 3-6[4]", "is no rotation"),
         (lambda rows: cell(rows, 4, 9, "90"), "frame 4, left_hip_yaw", "are these degrees"),
-        (lambda rows: [row.replace(",", ";") for row in rows], "line 1", "the header lacks root_translateX"),
-        (lambda rows: ["time," + "q," * 34 + "q", *rows], "line 1", "the header lacks root_translateX"),
+        (lambda rows: [row.replace(",", ";") for row in rows], "line 1", "neither numbers nor BONES-SEED's names"),
+        (lambda rows: ["time," + "q," * 34 + "q", *rows], "line 1", "neither numbers nor BONES-SEED's names"),
     ],
 )
 def test_malformed_files(tmp_path, squat, change, where, reason):
