@@ -354,5 +354,5 @@ def _reinforce(
         quiet=quiet,
     )
     if not quiet and progress.score is not None:
-        best = {name: round(value, 3) for name, value in progress.score["measures"].items() if type(value) is float}
-        print(f"best evaluation: {best}; {out}")
+        best = [f"{name} {value:.3g}" for name, value in progress.score["measures"].items() if type(value) is float]
+        print(f"best evaluation: {', '.join(best)}; {out}")

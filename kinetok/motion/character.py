@@ -50,7 +50,7 @@ class Character:
     """
 
     name: str
-    xml: str
+    xml: str = field(repr=False)
     roles: dict
     model: mujoco.MjModel = field(repr=False)
     body_names: tuple[str, ...]

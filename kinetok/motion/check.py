@@ -40,6 +40,7 @@ from kinetok.motion.skeleton import SkeletonMotion
 JUMP, JUMP_RATIO, JUMP_SMALL = 25.0, 2.0, 0.55  # rad/s, times the faster neighbour, rad
 FAST = 45.0  # rad/s
 SPIKE_ANGLE, SPIKE_SPEED, SPIKE_CALM = 0.2, 12.0, 1 / 3  # rad, rad/s, share of the step
+LIMIT = 0.05  # rad beyond a hinge's range; generated robot motion passes it by 0.02
 ROOT_FAST = 12.5  # m/s
 LEAD_SPEED, LEAD_REST, LEAD_FRAMES = 30.0, 0.1, 8  # rad/s, median rad from rest, frames
 FROZEN_SECONDS = 0.25
@@ -82,7 +83,7 @@ def mend(motion: M) -> tuple[M, list[Finding]]:
     for repair in (_mend_spikes, _mend_units):
         motion, more = repair(motion)
         found += _shifted(more, dropped)
-    found += _shifted([*_jumps(motion), *_root_jumps(motion), *_frozen(motion)], dropped)
+    found += _shifted([*_jumps(motion), *_root_jumps(motion), *_frozen(motion), *_beyond_limits(motion)], dropped)
     wrong_way = _up_axis(motion)
     found += wrong_way
     if not any(f.severity == "refused" and f.kind in ("up", "units") for f in found):
@@ -309,6 +310,25 @@ def _frozen(motion: SkeletonMotion | Clip) -> list[Finding]:
         if seconds >= FROZEN_SECONDS:
             message = f"nothing changes from frame {first} to {last + 1} ({seconds:.2f} s): the recording stood still"
             found.append(_finding("frozen", "note", message, frame=first, value=seconds))
+    return found
+
+
+def _beyond_limits(motion: SkeletonMotion | Clip) -> list[Finding]:
+    """Hinges of a clip that are bent further than their character's: the worst frame of each."""
+    if isinstance(motion, SkeletonMotion):
+        return []
+    model, found = Character.load(motion.character).model, []
+    for j in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & model.jnt_limited.astype(bool)):
+        (low, high), angle = model.jnt_range[j], motion.qpos[:, model.jnt_qposadr[j]]
+        beyond = np.maximum(low - angle, angle - high)
+        t = int(beyond.argmax())
+        if beyond[t] > LIMIT:
+            severity, remedy = _verdict(beyond[t])
+            message = (
+                f"at {angle[t]:+.2f} rad, {beyond[t]:.2f} beyond its range of {low:+.2f} to {high:+.2f}, and so in "
+                f"{np.mean(beyond > LIMIT):.0%} of the frames; {remedy}"
+            )
+            found.append(_finding("limit", severity, message, frame=t, joint=model.joint(j).name, value=beyond[t]))
     return found
 
 

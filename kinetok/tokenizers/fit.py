@@ -259,7 +259,11 @@ def _publish(
     )
     found = {best: np.stack([score.success, score.mpjpe_mm], axis=1)}
     Console().print(clip_table(names, found if np.isnan(taught).all() else found | {"teacher": taught}))
-    print(f"best stage: {best}; {score.summary()}; {(time.monotonic() - started) / 60:.1f} min; {out}")
+    told = (
+        f"success {score.success.mean():.0%} (mean form {score.success_mean_error.mean():.0%}), MPJPE "
+        f"{score.mpjpe_mm.mean():.0f} mm, {score.mpjpe_local_mm.mean():.0f} from the root"
+    )
+    print(f"best stage: {best}; {told}; {(time.monotonic() - started) / 60:.1f} min; {out}")
 
 
 def clip_table(names: Sequence[str], found: Mapping[str, np.ndarray]) -> Table:

@@ -213,7 +213,7 @@ def test_the_count_of_parameters_is_said_first(models, tmp_path, capsys):
     count, frozen, share = parameters_of(skill.adapted)
     first, *_, last = capsys.readouterr().out.splitlines()
     assert first == f"lora adapter of {count:,} parameters, {share:.2%} of the {frozen:,} that stay frozen"
-    assert last.startswith("best evaluation: {'target_distance_m': ") and last.endswith(str(tmp_path))
+    assert last.startswith("best evaluation: target_distance_m ") and last.endswith(str(tmp_path))
 
 
 def test_it_may_begin_with_another_skill(plain, models, tmp_path):

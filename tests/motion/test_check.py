@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kinetok import rotation
+from kinetok.motion.character import Character
 from kinetok.motion.check import check, mend, report
 from kinetok.motion.clip import Clip
 from kinetok.motion.formats import read, read_clips
@@ -198,6 +199,22 @@ def test_signs_and_full_turns_are_aligned(walk, humanoid):
     fixed, findings = mend(replace(walk, qpos=qpos))
     assert kinds(findings) == [("fixed", "sign", 10, "left_elbow")]
     np.testing.assert_allclose(fixed.qpos, walk.qpos, atol=1e-12)
+
+
+def test_a_knee_that_bends_the_wrong_way_is_refused():
+    body = Character.load("g1")
+    qpos = np.tile(body.stand(), (60, 1))
+    qpos[:, 0] = np.linspace(0, 0.5, 60)
+    clip = Clip(name="g1", character="g1", fps=30.0, qpos=qpos)
+    assert not [f for f in check(clip) if f.kind == "limit"]
+    knee = body.model.joint("left_knee_joint").qposadr[0]
+    low = body.model.joint("left_knee_joint").range[0]
+    for beyond, severity in ((0.03, None), (0.2, "note"), (1.0, "refused")):
+        qpos[20:35, knee] = low - 0.9 * beyond
+        qpos[30, knee] = low - beyond
+        found = [f for f in check(clip) if f.kind == "limit"]
+        expected = [(severity, "limit", 30, "left_knee_joint")] if severity else []
+        assert kinds(found) == expected and all("beyond its range of -0.09 to +2.88" in f.message for f in found)
 
 
 def test_frames_that_stand_still_are_noted():
