@@ -26,7 +26,7 @@ def main() -> None:
     """Motion of physically simulated characters, as tokens.
 
     \b
-    kinetok demo                                         what it does, in a minute
+    kinetok demo                                         what it does, in half a minute
     kinetok clips info walk.txt                          look at a motion
     kinetok tokenize fit --clips walk.txt --out runs/w   learn tokens through physics
     kinetok pretrain --tokenizer runs/w --clips walk.txt --out runs/g
@@ -39,7 +39,7 @@ def main() -> None:
 @click.option("--seconds", default=8.0, show_default=True, help="Length of each video.")
 @option_seed
 def demo(out, seconds, seed) -> None:
-    """Track a packaged clip, show its tokens, sample new motion, walk to targets; videos and a table in two minutes."""
+    """Track a packaged clip, show its tokens, sample new motion, walk to targets; videos and a table in half a minute."""
     from kinetok.demo import run_demo
 
     run_demo(out, seconds=seconds, seed=seed)

@@ -56,7 +56,7 @@ def finetune(prior, task, adapter, method, paths, hours, start, rebase, out, pre
     made of --clips (hindsight), by reward (rl), or one after the other.
 
     \b
-    Presets: laptop (4 million steps on one core), paper (GPC's sizes), tiny (tests).
+    Presets: laptop (an hour of two cores), gpu (for --device cuda), paper (GPC's sizes), tiny (tests).
     kinetok finetune --task target --method hindsight,rl --clips gaits.safetensors --out runs/target
     kinetok finetune --task steering --method sft,rl --clips zombie_walk.txt --out runs/zombie
     kinetok finetune --from runs/target --set task.distance=2,8 --out runs/further
