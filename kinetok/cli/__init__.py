@@ -39,7 +39,7 @@ def main() -> None:
 @click.option("--seconds", default=8.0, show_default=True, help="Length of each video.")
 @option_seed
 def demo(out, seconds, seed) -> None:
-    """Track a packaged clip, show its tokens, sample new motion, walk to targets; videos and a table in half a minute."""
+    """Track a packaged clip, show its tokens, sample new motion, walk to targets, in half a minute."""
     from kinetok.demo import run_demo
 
     run_demo(out, seconds=seconds, seed=seed)

@@ -197,7 +197,7 @@ class Training:
             )
             raise FloatingPointError(
                 f"{error}; training stopped. The rollout is in {dump}; {left}. "
-                "Try a smaller rate (--set ppo.lr, of a stage teacher.ppo.lr), or look at the clip with `kinetok clips info`"
+                "Try a smaller rate (--set ppo.lr, of a stage teacher.ppo.lr), or see the clip by `kinetok clips info`"
             ) from error
 
     def save(self, progress: Progress) -> None:
