@@ -266,6 +266,28 @@ def clips_split(source: Path, out: Path, share: float, mirror: bool, seed: int) 
         click.echo(f"wrote {out / name}.safetensors: {len(part)} clips, {part.seconds.sum():.1f} s")
 
 
+@clips.command("cycle")
+@click.argument("source", type=PATHS)
+@click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
+@click.option("--name", default=None, help="Which clip of a library; default its only one.")
+@click.option("--shortest", default=0.5, show_default=True, type=Number(0.2, 60), help="Seconds of a cycle at least.")
+@click.option("--longest", default=2.5, show_default=True, type=Number(0.2, 60), help="Seconds of a cycle at most.")
+def clips_cycle(source: Path, out: Path, name: str | None, shortest: float, longest: float) -> None:
+    """Cut the most even gait cycle out of a recording and close it, so that it repeats: a loop, as `vary` wants it.
+
+    \b
+    kinetok clips import walk.bvh --out walk.safetensors
+    kinetok clips cycle walk.safetensors --out walk-cycle.safetensors
+    kinetok clips vary walk-cycle.safetensors --turn 80 --count 4 --out walk-varied.safetensors
+    """
+    from kinetok.motion.cycle import cycle
+
+    check_suffix(out, ".safetensors")
+    found = cycle(one_clip(source, name), shortest=shortest, longest=longest)
+    say(f"{found.name}: {found.source}")
+    write_motion(out, found)
+
+
 @clips.command("vary")
 @click.argument("source", type=PATHS)
 @click.option("--out", required=True, type=PATHS, help="The library to write, ending in .safetensors.")
@@ -313,7 +335,10 @@ def clips_vary(
             into_gait = restyle(other, amount=style, seed=drawn) if other else None
         varied.append(vary(gait, into=into_gait, seed=drawn, **told))
     if not clip.loop and varied[0].seconds < seconds - 0.1:
-        say(f"{clip.name} is no loop: gone through once, {varied[0].seconds:.1f} s of the {seconds:g} asked for")
+        say(
+            f"{clip.name} is no loop: gone through once, {varied[0].seconds:.1f} s of the {seconds:g} asked for; "
+            "`kinetok clips cycle` cuts a loop out of a gait"
+        )
     if count > 1:
         varied = [replace(motion, name=f"{motion.name}-{number}") for number, motion in enumerate(varied, 1)]
     write_motion(out, *varied)

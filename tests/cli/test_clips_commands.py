@@ -3,8 +3,13 @@
 import json
 
 import numpy as np
+import pytest
 
+from kinetok import rotation
+from kinetok.motion.character import Character
+from kinetok.motion.clip import Clip
 from kinetok.motion.formats import read_clips
+from kinetok.motion.library import ClipLibrary
 from tests.cli.typed import frames, kinetok, write_clip
 
 
@@ -55,6 +60,23 @@ def test_files_of_one_name_are_told_apart(clip, tmp_path):
     assert told.exit_code == 0 and "another clip is called wave, so this one is wave-2" in told.output
     assert kinetok("clips", "import", more[1], "--append", "--out", out).exit_code == 0
     assert [c.name for c in read_clips(out)] == ["wave", "wave-2", "wave-3"]
+
+
+def test_a_recording_becomes_a_cycle_and_a_cycle_long_motions(tmp_path):
+    body, phase = Character.load("humanoid"), np.arange(120) / 30
+    qpos = np.tile(body.stand(), (120, 1))
+    qpos[:, 0] = phase
+    at = int(body.model.joint("left_hip").qposadr[0])
+    qpos[:, at : at + 4] = rotation.from_rotvec(np.outer(0.5 * np.sin(2 * np.pi * phase), [0.0, 1.0, 0.0]))
+    source, loop, out = (tmp_path / f"{name}.safetensors" for name in ("recorded", "cycle", "varied"))
+    ClipLibrary.write(source, [Clip(name="gait", character="humanoid", fps=30.0, qpos=qpos)])
+    once = kinetok("clips", "vary", source, "--out", out, "--seconds", 9)
+    assert once.exit_code == 0 and "gait is no loop: gone through once" in once.output and "clips cycle" in once.output
+    told = kinetok("clips", "cycle", source, "--out", loop)
+    assert told.exit_code == 0 and " s of gait" in told.output
+    assert kinetok("clips", "vary", loop, "--out", out, "--seconds", 9).exit_code == 0
+    (cycle,), (varied,) = read_clips(loop), read_clips(out)
+    assert cycle.loop and cycle.seconds == pytest.approx(1.0, abs=0.04) and varied.seconds == pytest.approx(9, abs=0.1)
 
 
 def test_what_is_refused_can_be_left_out(clip, tmp_path):
