@@ -17,7 +17,7 @@ import multiprocessing.connection
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from kinetok.checkpoint import CheckpointError, load_artifact, load_state, locate, refuse_foreign, save_artifact
 from kinetok.config import ConfigError, at_least, diff, nearest, to_dict
@@ -38,6 +37,7 @@ from kinetok.rl.rollout import torch_threads
 from kinetok.rl.training import JUDGE, Progress
 from kinetok.sim.env import EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
+from kinetok.tokenizers.card import clip_table, tokenizer_card
 from kinetok.tokenizers.distill import DistillStage, distill
 from kinetok.tokenizers.quantizer import ContinuousConfig
 from kinetok.tokenizers.tokenizer import MotionTokenizer, TokenizerConfig
@@ -163,6 +163,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     stories: dict[str, str] = {}
+    scores: dict[str, TrackingScore] = {}
     if "teacher" in config.stages:
         train_teachers(clips, config, out / "teachers", seed=seed, threads=threads)
     story = ["start"] if config.start else []
@@ -171,7 +172,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
         parents |= {f"teacher/{name}": teacher.hash for name, teacher in zip(names, teachers, strict=True)}
         story += ["teacher", "distill"]
         stories["distill"] = " -> ".join(story)
-        distill(
+        scores["distill"] = distill(
             student,
             teachers * 2 if images else teachers,
             table,
@@ -187,7 +188,7 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     if "ppo" in config.stages:
         story.append("ppo")
         stories["ppo"] = " -> ".join(story)
-        train_ppo(
+        scores["ppo"] = train_ppo(
             student,
             table,
             config.ppo,
@@ -202,7 +203,12 @@ def _fit(clips: Sequence[Clip], config: FitConfig, out: Path, *, seed: int, thre
     if not stories:
         Console().print(clip_table(names, {"teacher": taught[: len(names)]}))
         return MotionTokenizer.from_pretrained(out / "teachers" / names[0])
-    ranks.first(lambda: _publish(out, stories, config, table, taught, started, seed=seed, threads=threads))
+    if len(scores) > 1:  # by the same episodes, those of the last stage's evaluations
+        scores = {stage: _judged(out / stage, config, table, seed, threads) for stage in scores}
+    push = config.ppo.eval_push if "ppo" in scores else 0.0
+    best = max(scores, key=lambda stage: scores[stage].merit)
+    told = {"story": stories[best], "seed": seed, "push": push}
+    ranks.first(lambda: _publish(out, best, scores[best], taught, started, **told))
     return MotionTokenizer.from_pretrained(out)
 
 
@@ -218,70 +224,49 @@ def _refuse_other_clips(out: Path, table: ReferenceTable) -> None:
                 )
 
 
+def _judged(place: Path, config: FitConfig, table: ReferenceTable, seed: int, threads: int) -> TrackingScore:
+    """What the artifact of a stage does in the evaluation of the stage `ppo`."""
+    stage, tokenizer = config.ppo, config.tokenizer
+    return track(
+        MotionTokenizer.from_pretrained(place),
+        table,
+        future=tokenizer.future,
+        scene=tokenizer.scene,
+        episodes=stage.eval_episodes,
+        push=stage.eval_push,
+        threads=threads,
+        seed=seed + JUDGE,
+    )
+
+
 def _publish(
     out: Path,
-    stories: Mapping[str, str],
-    config: FitConfig,
-    table: ReferenceTable,
+    best: str,
+    score: TrackingScore,
     taught: np.ndarray,
     started: float,
     *,
+    story: str,
     seed: int,
-    threads: int,
+    push: float,
 ) -> None:
-    """Copy the artifact of the best stage to `out`, and show how well it follows each clip. Where there are several,
-    all are judged by the same episodes, those of the last one's evaluations."""
-    last, names = config.distill if tuple(stories) == ("distill",) else config.ppo, table.names
-    push = last.eval_push if isinstance(last, PPOStage) else 0.0
-    tokenizers = {stage: MotionTokenizer.from_pretrained(out / stage) for stage in stories}
-    scores = {
-        stage: track(
-            tokenizer,
-            table,
-            future=config.tokenizer.future,
-            scene=config.tokenizer.scene,
-            episodes=last.eval_episodes,
-            push=push,
-            threads=threads,
-            seed=seed + JUDGE,
-        )
-        for stage, tokenizer in tokenizers.items()
-    }
-    best = max(scores, key=lambda stage: scores[stage].merit)
-    score, artifact = scores[best], load_artifact(out / best)
+    """Copy the best stage's artifact to `out`, and show how well it follows each clip."""
+    artifact, tokenizer = load_artifact(out / best), MotionTokenizer.from_pretrained(out / best)
     save_artifact(
         out,
         kind=artifact.kind,
         config=artifact.config,
         tensors=artifact.tensors,
-        card=tokenizer_card(tokenizers[best], names, stories[best], seed, score, push),
+        card=tokenizer_card(tokenizer, score.names, story, seed, score, push),
         parents=artifact.parents,
     )
     found = {best: np.stack([score.success, score.mpjpe_mm], axis=1)}
-    Console().print(clip_table(names, found if np.isnan(taught).all() else found | {"teacher": taught}))
+    Console().print(clip_table(score.names, found if np.isnan(taught).all() else found | {"teacher": taught}))
     told = (
         f"success {score.success.mean():.0%} (mean form {score.success_mean_error.mean():.0%}), MPJPE "
         f"{score.mpjpe_mm.mean():.0f} mm, {score.mpjpe_local_mm.mean():.0f} from the root"
     )
     print(f"best stage: {best}; {told}; {(time.monotonic() - started) / 60:.1f} min; {out}")
-
-
-def clip_table(names: Sequence[str], found: Mapping[str, np.ndarray]) -> Table:
-    """How well each clip is followed: success and MPJPE of whoever did, the first one's hardest clips first.
-
-    found: who -> (K, 2), share of successes and millimetres; NaN where that is not known.
-    """
-    first = next(iter(found.values()))
-    table = Table("clip")
-    for who in found:
-        table.add_column(f"{who}: success", justify="right")
-        table.add_column("MPJPE mm", justify="right")
-    for k in sorted(range(len(names)), key=lambda k: (first[k, 0], -first[k, 1])):
-        cells = [
-            text for numbers in found.values() for text in (f"{100 * numbers[k, 0]:.0f} %", f"{numbers[k, 1]:.0f}")
-        ]
-        table.add_row(names[k], *("-" if text.startswith("nan") else text for text in cells))
-    return table
 
 
 def _taught_numbers(folder: Path, names: Sequence[str], teachers: int) -> np.ndarray:
@@ -440,56 +425,3 @@ def _teach(
         quiet=quiet,
     )
     return f"success {score.success.mean():.2f}, {score.mpjpe_mm.mean():.0f} mm"
-
-
-def tokenizer_card(
-    tokenizer: MotionTokenizer,
-    names: Sequence[str],
-    story: str,
-    seed: int,
-    score: TrackingScore,
-    push: float = 0.0,
-) -> str:
-    """The model card: use, training, inputs and outputs, results and limits."""
-    config = tokenizer.config
-    kind = config.quantizer.kind
-    rows = "\n".join(
-        f"| {name} | {100 * s:.0f} % | {100 * m:.0f} % | {e:.0f} |"
-        for name, s, m, e in zip(score.names, score.success, score.success_mean_error, score.mpjpe_mm, strict=True)
-    )
-    pushed = f", pushed by {push:g} m/s every two seconds" if push else ""
-    total = (
-        f"| all | {100 * score.success.mean():.1f} % | {100 * score.success_mean_error.mean():.1f} % "
-        f"| {score.mpjpe_mm.mean():.1f} |"
-    )
-    tokens = (
-        ""
-        if kind == "continuous"
-        else (
-            f"{tokenizer.layout.tokens_per_step} tokens per control step from a vocabulary of "
-            f"{tokenizer.layout.vocabulary}; "
-        )
-    )
-    return f"""# {kind} motion tokenizer for `{config.character}`
-
-Turns a reference motion into codes and codes into joint torques, in physics at {config.scene.control_hz} Hz.
-
-    from kinetok.tokenizers.tokenizer import MotionTokenizer
-    tokenizer = MotionTokenizer.from_pretrained("PATH")
-
-- Encoder input: {", ".join(config.encoder_inputs)} with future frames {list(config.future)}; decoder input:
-  {", ".join(config.decoder_inputs) or "nothing"} and the code. Output: {tokenizer.actions} PD targets in radians.
-- {tokens}quantizer `{to_dict(config.quantizer)}`.
-- Stages: {story}. Seed {seed}. Clips: {", ".join(names)}.
-
-## Tracking, {score.episodes} episodes a clip, 20 s or to the clip's end, started with 0.01 rad of noise{pushed}
-
-Success: largest body error of the episode below 0.5 m; mean form: mean body error below 0.5 m.
-
-| clip | success | success (mean form) | MPJPE mm |
-|---|---|---|---|
-{rows}
-{total}
-
-Limits: flat floor, no self-collision, the clips above. Licence: Apache-2.0.
-"""

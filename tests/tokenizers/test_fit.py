@@ -1,4 +1,3 @@
-import io
 import os
 import re
 import signal
@@ -8,10 +7,8 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from rich.console import Console
 
 from kinetok.checkpoint import CheckpointError, load_artifact, load_state
 from kinetok.config import ConfigError, override
@@ -21,7 +18,7 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.library import ClipLibrary
 from kinetok.rl import training
 from kinetok.tokenizers import distill, train
-from kinetok.tokenizers.fit import clip_table, fit, train_teachers
+from kinetok.tokenizers.fit import fit, train_teachers
 from kinetok.tokenizers.tokenizer import MotionTokenizer
 
 BOX = """
@@ -124,16 +121,6 @@ def test_it_ends_with_a_table_of_the_clips(done, clips, small, capsys):
     wave = next(row for row in rows if row[1] == "wave")
     assert wave[-5:] == [f"{100 * score['success'][0]:.0f}", "%", "│", f"{score['mpjpe_mm'][0]:.0f}", "│"]
     assert lines[-1].startswith("best stage: ")
-
-
-def test_the_table_puts_the_hardest_clip_first_and_says_what_is_not_known():
-    student, teacher = np.array([[1, 30.4], [0.5, 99], [1, 40]]), np.array([[1, 20], [np.nan] * 2, [0, 9]])
-    console = Console(file=io.StringIO(), width=100)
-    console.print(clip_table(("a", "b", "c"), {"distill": student, "teacher": teacher}))
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert "distill: success" in lines[1] and "teacher: success" in lines[1]
-    rows = ["".join(line.split()) for line in lines[3:-1]]
-    assert rows == ["│b│50%│99│-│-│", "│c│100%│40│0%│9│", "│a│100%│30│100%│20│"]
 
 
 SLEEPER = """
