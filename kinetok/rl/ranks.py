@@ -20,6 +20,10 @@ from typing import TypeVar
 
 import torch
 import torch.distributed as distributed
+
+# Its functions' default group is the one there is when it is imported, which an optimizer does; imported after ours is
+# made, it would keep the group's threads beyond the group's end, and they may abort the process as that ends.
+import torch.distributed.nn.functional
 from torch import Tensor
 
 from kinetok.config import ConfigError
