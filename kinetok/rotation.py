@@ -110,13 +110,9 @@ def about_z(angle: Array) -> Array:
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
 
 
-def turn(v: Array, cos: Array, sin: Array, out: Array | None = None) -> Array:
-    """Vectors v (..., 3) turned about z by the angle whose cosine and sine are given (broadcast to v[..., 0]).
-
-    With `out`, the result is written there.
-    """
-    if out is None:
-        out = np.empty(np.broadcast_shapes(v.shape, (*np.shape(cos), 1)), dtype=v.dtype)
+def turn(v: Array, cos: Array, sin: Array) -> Array:
+    """Vectors v (..., 3) turned about z by the angle whose cosine and sine are given (broadcast to v[..., 0])."""
+    out = np.empty(np.broadcast_shapes(v.shape, (*np.shape(cos), 1)), dtype=v.dtype)
     x, y = v[..., 0], v[..., 1]
     out[..., 0] = cos * x - sin * y
     out[..., 1] = sin * x + cos * y

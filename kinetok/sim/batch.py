@@ -10,13 +10,21 @@ reported, never silently reset (MuJoCo resets such a row and raises a warning co
 errors count as failed). It knows no clip, task or reward.
 """
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
+from llvmlite.binding import load_library_permanently
 from mujoco.batch import Batch, SimulationError
+from numba import types
+
+from kinetok.sim.kernels import kernel
 
 VEL = mujoco.mjtStage.mjSTAGE_VEL
+FEW = 64  # rows that are not worth another thread
 # BADCTRL among them: MuJoCo replaces controls that are not numbers by zero and goes on.
 BLOW_UPS = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
 
@@ -44,29 +52,46 @@ class BodyState:
 
     def assign_(self, ids: np.ndarray, other: "BodyState") -> None:
         """Overwrite rows ids with another state's rows."""
-        for name in ("pos", "mat", "linear", "angular", "quat"):
-            getattr(self, name)[ids] = getattr(other, name)
+        for name, values in vars(self).items():
+            values[ids] = getattr(other, name)
+
+
+def _mujoco() -> Path:
+    """MuJoCo's library, which lies in its package under another name on each system."""
+    here = Path(mujoco.__file__).parent
+    return next(path for pattern in ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll") for path in here.glob(pattern))
+
+
+load_library_permanently(str(_mujoco()))
+MODEL_DATA = types.void(types.intp, types.intp)
+mj_kinematics, mj_com_pos, mj_com_vel = (
+    types.ExternalFunction(name, MODEL_DATA) for name in ("mj_kinematics", "mj_comPos", "mj_comVel")
+)
 
 
 class BatchSim:
-    """`rows` simulations of one model on `threads` threads (0: all cores)."""
+    """`rows` simulations of one model on `threads` threads (0: all cores).
+
+    After a step a batch's body states are one substep old. It can bring them up to date together with contacts and
+    forces, which nobody asks for; so MuJoCo's kinematics are called here for each row, in a fifth of the time.
+    """
 
     def __init__(self, model: mujoco.MjModel, rows: int, threads: int = 0):
         self.model, self.rows = model, rows
-        # Persistent: a step goes on from the kinematics that the last one ended with, instead of computing them again.
-        self._batch = Batch(model, rows, threads, persistent=True)
+        self._batch = Batch(model, rows, threads)
         self.qpos, self.qvel, self._ctrl = (self._batch.bind(n) for n in ("qpos", "qvel", "ctrl"))
-        self._xpos, self._xmat, self._cvel, self._com = (
-            self._batch.bind(n) for n in ("xpos", "xmat", "cvel", "subtree_com")
-        )
-        self._bodies = model.nbody - 1
         self._rest = self._batch.state[0].copy()
+        self._blow_ups = self._counted()
+        self._data = [mujoco.MjData(model) for _ in range(self._batch.nthread)]
+        self._pool = ThreadPoolExecutor(self._batch.nthread)
+        self._now = self._evaluated(np.arange(rows))
 
     def set_state(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Put rows ids (n,) into poses qpos (n, nq) and velocities qvel (n, nv) and refresh their body states."""
         self._batch.state[ids] = self._rest  # what reset does, without a second call to the threads
         self.qpos[ids], self.qvel[ids] = qpos, qvel
-        self._batch.forward(ids, stage=VEL)
+        self._now = BodyState(**{name: values.copy() for name, values in vars(self._now).items()})
+        self._now.assign_(ids, self._evaluated(np.asarray(ids)))
 
     def add_velocity(self, ids: np.ndarray, delta: np.ndarray) -> None:
         """Push rows ids: add delta (n, 3) m/s to the root's linear velocity. Body states follow at the next step."""
@@ -79,37 +104,68 @@ class BatchSim:
     def step(self, ctrl: np.ndarray, substeps: int) -> np.ndarray:
         """Advance all rows by `substeps` physics steps under ctrl (N, nu); returns ids (k,) of the failed rows."""
         self._ctrl[:] = ctrl
-        before = self._blow_ups()
         raised = np.empty(0, dtype=int)
         try:
-            self._batch.step(nstep=substeps, stage=VEL)
+            self._batch.step(nstep=substeps)
         except SimulationError as error:
             raised = np.asarray(error.ids)
-        return np.union1d(raised, np.flatnonzero(self._blow_ups() > before))
+        self._now = self._evaluated(np.arange(self.rows))
+        before, self._blow_ups = self._blow_ups, self._counted()
+        return np.union1d(raised, np.flatnonzero(self._blow_ups > before))
 
-    def _blow_ups(self) -> np.ndarray:
+    def _counted(self) -> np.ndarray:
         return self._batch.warning[:, BLOW_UPS, 1].sum(1)  # (N, warning, [last info, count])
 
     def state(self, ids: np.ndarray | None = None) -> BodyState:
-        """Fresh body states of all rows, or of rows ids."""
-        rows = slice(None) if ids is None else ids
-        pos = self._xpos[rows, 1:]
-        cvel = self._cvel[rows, 1:].astype(np.float32)
-        arm = (pos - self._com[rows, 1:2]).astype(np.float32)
-        angular, linear = cvel[..., :3], cvel[..., 3:]
-        return BodyState(
-            pos=pos.astype(np.float32),
-            mat=self._xmat[rows, 1:].astype(np.float32).reshape(len(pos), self._bodies, 3, 3),
-            linear=linear + cross(angular, arm),
-            angular=angular,
-            quat=self.qpos[rows, 3:7].astype(np.float32),
+        """Fresh body states of all rows, or of rows ids; not to be written to."""
+        return self._now if ids is None else self._now.rows(ids)
+
+    def _evaluated(self, rows: np.ndarray) -> BodyState:
+        shape = len(rows), self.model.nbody - 1
+        body = BodyState(
+            pos=np.empty((*shape, 3), np.float32),
+            mat=np.empty((*shape, 3, 3), np.float32),
+            linear=np.empty((*shape, 3), np.float32),
+            angular=np.empty((*shape, 3), np.float32),
+            quat=np.empty((len(rows), 4), np.float32),
         )
 
+        def evaluate(data: mujoco.MjData, part: slice) -> None:
+            own = data.qpos, data.qvel, data.xpos, data.xmat, data.cvel, data.subtree_com
+            out = (values[part] for values in (body.pos, body.mat, body.linear, body.angular, body.quat))
+            _evaluate(self.model._address, data._address, *own, self.qpos, self.qvel, rows[part], *out)
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product (..., 3); np.cross spends most of its time moving axes."""
-    out = np.empty_like(a)
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
+        self._divided(evaluate, len(rows))
+        return body
+
+    def _divided(self, work: Callable[[mujoco.MjData, slice], None], rows: int) -> None:
+        """work for parts of the rows side by side, each with an MjData of its own."""
+        parts = min(len(self._data), rows // FEW + 1)
+        edges = [rows * part // parts for part in range(parts + 1)]
+        jobs = [(data, slice(*ends)) for data, *ends in zip(self._data, edges[:-1], edges[1:], strict=False)]
+        others = [self._pool.submit(work, *job) for job in jobs[1:]]
+        work(*jobs[0])
+        for other in others:
+            other.result()
+
+
+@kernel
+def _evaluate(model, data, q, v, xpos, xmat, cvel, com, qpos, qvel, rows, pos, mat, linear, angular, quat):
+    """Body states of `rows` of qpos and qvel, through an MjData at address `data` whose arrays are q to com."""
+    for n in range(len(rows)):
+        row = rows[n]
+        q[:], v[:], quat[n] = qpos[row], qvel[row], qpos[row, 3:7]
+        mj_kinematics(model, data)
+        mj_com_pos(model, data)
+        mj_com_vel(model, data)
+        for b in range(pos.shape[1]):
+            # cvel: angular, then linear velocity of what of the body is at the whole's centre of mass
+            wx, wy, wz = cvel[b + 1, 0], cvel[b + 1, 1], cvel[b + 1, 2]
+            x, y, z = xpos[b + 1, 0] - com[1, 0], xpos[b + 1, 1] - com[1, 1], xpos[b + 1, 2] - com[1, 2]
+            linear[n, b, 0] = cvel[b + 1, 3] + wy * z - wz * y
+            linear[n, b, 1] = cvel[b + 1, 4] + wz * x - wx * z
+            linear[n, b, 2] = cvel[b + 1, 5] + wx * y - wy * x
+            for i in range(3):
+                angular[n, b, i], pos[n, b, i] = cvel[b + 1, i], xpos[b + 1, i]
+                for j in range(3):
+                    mat[n, b, i, j] = xmat[b + 1, 3 * i + j]

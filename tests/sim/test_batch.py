@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kinetok.motion.character import Character
-from kinetok.sim.batch import BatchSim, cross
+from kinetok.sim.batch import FEW, BatchSim
 from kinetok.sim.scene import SceneConfig, build_scene
 
 ROWS, SUBSTEPS = 5, 4
@@ -64,6 +64,23 @@ def test_body_state_is_fresh_and_mujocos_own(scene):
         np.testing.assert_array_equal(getattr(some, name), getattr(state.rows(np.array([3, 1])), name))
 
 
+def test_rows_divided_among_threads_are_the_same_bits(scene):
+    rows, rng = 3 * FEW + 1, np.random.default_rng(0)
+    qpos, qvel = np.tile(scene.qpos0, (rows, 1)), rng.standard_normal((rows, scene.nv))
+    qpos[:, 7:] += 0.3 * rng.standard_normal((rows, scene.nq - 7))
+    one, two = BatchSim(scene, rows, 1), BatchSim(scene, rows, 2)
+    for sim in (one, two):
+        sim.set_state(np.arange(rows), qpos, qvel)
+        sim.step(np.zeros((rows, scene.nu)), SUBSTEPS)
+    for name, values in vars(one.state()).items():
+        np.testing.assert_array_equal(values, getattr(two.state(), name))
+    before = one.state()
+    kept = before.pos.copy()
+    one.set_state(np.array([3]), qpos[:1], qvel[:1])
+    np.testing.assert_array_equal(before.pos, kept)  # what was read stays
+    assert not np.array_equal(one.state().pos[3], kept[3]) and np.array_equal(one.state().pos[4:], kept[4:])
+
+
 @pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e12])
 def test_a_blown_up_row_is_reported_and_contained(scene, velocity, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log file where it stands
@@ -110,11 +127,6 @@ def test_friction_of_the_floor_counts(scene):
     assert slide(BatchSim(build_scene(Character.load("humanoid"), SceneConfig(friction=0.1)), ROWS, 1), scene)[
         0
     ] == pytest.approx(travel[1], abs=1e-6)
-
-
-def test_cross():
-    a, b = np.random.default_rng(0).normal(size=(2, 7, 5, 3))
-    np.testing.assert_allclose(cross(a, b), np.cross(a, b))
 
 
 def test_set_state_forgets_what_the_row_did_before(scene):

@@ -44,8 +44,9 @@ def window(s: BodyState, reference: BodyState) -> np.ndarray:
     """Each reference row seen F times as the future of its body."""
     pose = observe.pose_features(reference.pos, reference.mat, reference.quat)
     heading = rotation.heading(reference.quat)
-    repeat = [np.repeat(x[:, None], F, axis=1) for x in (pose, reference.pos[:, 0], heading)]
-    return observe.window_features(s, *repeat)
+    ahead = np.repeat(np.arange(N)[:, None], F, axis=1)
+    facing = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return observe.window_features(s, pose, reference.pos[:, 0], facing, ahead)
 
 
 def test_sizes():
@@ -99,8 +100,8 @@ def test_rotation_error_is_sine_times_axis():
 def test_written_into_a_slice_of_an_observation():
     a, b = body(0), body(1)
     obs = np.full((N, 300), 7.0, dtype=np.float32)
-    observe.state_features(a, obs[:, 3 : 3 + observe.state_size(B)])
-    observe.error_features(a, b, obs[:, 100 : 100 + observe.error_size(B)])
+    observe.state_features(a, obs, 3)
+    observe.error_features(a, b, None, obs, 100)
     np.testing.assert_array_equal(obs[:, 3:61], observe.state_features(a)[:, :58])
     np.testing.assert_array_equal(obs[:, 100:148], observe.error_features(a, b))
     assert (obs[:, :3] == 7).all() and (obs[:, 61:100] == 7).all() and (obs[:, 148:] == 7).all()

@@ -22,6 +22,7 @@ from kinetok.motion.kinematics import Motion, kinematics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim import observe
 from kinetok.sim.batch import BodyState
+from kinetok.sim.kernels import kernel
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
 
@@ -96,6 +97,7 @@ class ReferenceTable:
         self.qpos, self.qvel, self.heading = columns["qpos"], columns["qvel"], columns["heading"]
         self.pose, self.target = columns["pose"], columns["target"]
         self.root = np.ascontiguousarray(self.body.pos[:, 0])
+        self.facing = np.stack([np.cos(self.heading), np.sin(self.heading)], axis=1)
 
 
 def _tabulated(body: Character, clip: Clip, frames: int, control_hz: int) -> dict[str, np.ndarray]:
@@ -207,21 +209,15 @@ class Tracking:
         if ids is not None:
             frame, last, reference = frame[ids], last[ids], reference.rows(ids)
         ahead = np.minimum(frame[:, None] + self._future, last[:, None])
-        root, reference = self._leashed(body, table.root[ahead], reference)
-        obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
-        part = {name: obs[:, columns] for name, columns in self.layout.items()}
-        observe.state_features(body, part["state"])
-        observe.window_features(body, table.pose[ahead], root, table.heading[ahead], part["window"])
-        observe.error_features(body, reference, part["error"])
-        part["target"][:] = table.target[np.minimum(frame + 1, last)]
-        return obs
-
-    def _leashed(self, body: BodyState, root: np.ndarray, reference: BodyState) -> tuple[np.ndarray, BodyState]:
-        """Future roots (n, F, 3) and the reference, brought nearer by as much as it is beyond the leash."""
         away = reference.pos[:, 0, :2] - body.pos[:, 0, :2]
-        beyond = np.zeros((len(away), 1, 3), dtype=np.float32)
-        beyond[:, 0, :2] = away - _no_longer(away, self.config.leash)
-        return root - beyond, replace(reference, pos=reference.pos - beyond)
+        beyond = away - _no_longer(away, self.config.leash)
+        obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
+        start = {name: columns.start for name, columns in self.layout.items()}
+        observe.state_features(body, obs, start["state"])
+        observe.window_features(body, table.pose, table.root, table.facing, ahead, beyond, obs, start["window"])
+        observe.error_features(body, reference, beyond, obs, start["error"])
+        obs[:, self.layout["target"]] = table.target[np.minimum(frame + 1, last)]
+        return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """GPC eq. 8 against the frame the row should have reached."""
@@ -237,8 +233,9 @@ class Tracking:
         if self.config.failure.slack:
             offset = offset.copy()
             offset[..., :2] -= _no_longer(offset[:, :1, :2], self.config.failure.slack)
-        error = lengths(offset)
-        fine = (error.max(1) < self.config.failure.largest) & (error.mean(1) < self.config.failure.mean)
+        largest, mean = np.empty((2, len(offset)), dtype=np.float32)
+        _distances(offset, largest, mean)
+        fine = (largest < self.config.failure.largest) & (mean < self.config.failure.mean)
         return ~fine, self.frame >= self.table.last[self.clip]
 
     def state_dict(self) -> dict:
@@ -250,6 +247,19 @@ class Tracking:
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
         """Failure-weighted clip sampling learns from every finished episode."""
         self.weights.update(self.clip[ids], ~terminated)
+
+
+@kernel
+def _distances(offset, largest, mean):
+    """Of each row's bodies, offset (N, B, 3); the mean is no number where one of them is none."""
+    for row in range(len(offset)):
+        total, most = offset[row, 0, 0] * 0, offset[row, 0, 0] * 0
+        for b in range(offset.shape[1]):
+            x, y, z = offset[row, b, 0], offset[row, b, 1], offset[row, b, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            total += length
+            most = max(most, length)
+        largest[row], mean[row] = most, total / offset.shape[1]
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:

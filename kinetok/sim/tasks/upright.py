@@ -61,7 +61,7 @@ class Upright:
     def blank(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
         """Observations (n, O) float32 with the state filled in, and the task's columns of them, yet to be filled."""
         obs = np.empty((len(body.pos), self.obs_size), dtype=np.float32)
-        observe.state_features(body, obs[:, self.layout["state"]])
+        observe.state_features(body, obs, self.layout["state"].start)
         return obs, obs[:, self.layout["task"]]
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
