@@ -31,7 +31,6 @@ from kinetok import presets
 from kinetok.logger import read_metrics
 from kinetok.motion.formats import read_deepmimic
 from kinetok.motion.library import ClipLibrary
-from kinetok.sim.batch import VEL
 from kinetok.sim.env import Env, EnvConfig
 from kinetok.sim.tasks.tracking import ReferenceTable, Tracking, TrackingConfig
 from kinetok.tokenizers.fit import fit
@@ -52,9 +51,9 @@ def env_step(clip: Path, rows: int, *, steps: int = 150, skip: int = 20) -> dict
 
     The packaged tokenizer drives the worlds, so that they walk as they do in training; its own time is not counted.
     At every control step the raw batch of the same model, threads and substeps starts from the same states under the
-    same controls; `current`: and brings the bodies' positions and velocities up to the last substep, which MuJoCo
-    leaves one behind and an observation cannot do without. The default window of seven future frames is observed; 10 s
-    episodes keep resets in the figures.
+    same controls; `current`: and brings all that follows from positions and velocities, contacts and forces too, up to
+    the last substep, of which an observation needs where the bodies are. The default window of seven future frames is
+    observed; 10 s episodes keep resets in the figures.
     """
     tokenizer = MotionTokenizer.from_pretrained("humanoid-fsq")
     table = ReferenceTable(ClipLibrary.of([read_deepmimic(clip)]))
@@ -91,7 +90,8 @@ def env_step(clip: Path, rows: int, *, steps: int = 150, skip: int = 20) -> dict
         took = time.perf_counter() - begin
         after = before or step_raw(action)
         obs, finished = step.obs, finished + len(step.done)
-        samples.append((after, step_raw(action, stage=VEL), took, seconds(step_gym) / len(gym_actions)))
+        current = step_raw(action, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        samples.append((after, current, took, seconds(step_gym) / len(gym_actions)))
     raw_s, current_s, env_s, gym_s = np.array(samples[skip:]).T
     return {
         "rows": rows,

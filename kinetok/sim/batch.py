@@ -23,7 +23,6 @@ from numba import types
 
 from kinetok.sim.kernels import kernel
 
-VEL = mujoco.mjtStage.mjSTAGE_VEL
 FEW = 64  # rows that are not worth another thread
 # BADCTRL among them: MuJoCo replaces controls that are not numbers by zero and goes on.
 BLOW_UPS = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
@@ -59,9 +58,13 @@ class BodyState:
 def _mujoco() -> Path:
     """MuJoCo's library, which lies in its package under another name on each system."""
     here = Path(mujoco.__file__).parent
-    return next(path for pattern in ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll") for path in here.glob(pattern))
+    for name in ("libmujoco*.so*", "libmujoco*.dylib", "mujoco.dll"):
+        for path in here.glob(name):
+            return path
+    raise ImportError(f"{here}: MuJoCo's own library is not in its package; pip install --force-reinstall mujoco")
 
 
+# Called by address from compiled loops: the package binds these functions for one MjData at a time.
 load_library_permanently(str(_mujoco()))
 MODEL_DATA = types.void(types.intp, types.intp)
 mj_kinematics, mj_com_pos, mj_com_vel = (
@@ -142,7 +145,7 @@ class BatchSim:
         """work for parts of the rows side by side, each with an MjData of its own."""
         parts = min(len(self._data), rows // FEW + 1)
         edges = [rows * part // parts for part in range(parts + 1)]
-        jobs = [(data, slice(*ends)) for data, *ends in zip(self._data, edges[:-1], edges[1:], strict=False)]
+        jobs = [(self._data[part], slice(edges[part], edges[part + 1])) for part in range(parts)]
         others = [self._pool.submit(work, *job) for job in jobs[1:]]
         work(*jobs[0])
         for other in others:
