@@ -24,6 +24,8 @@ from numba import types
 from kinetok.sim.kernels import kernel
 
 FEW = 64  # rows that are not worth another thread
+Rows = np.ndarray | slice  # ids (n,), or a run of rows
+ALL = slice(None)
 # BADCTRL among them: MuJoCo replaces controls that are not numbers by zero and goes on.
 BLOW_UPS = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC", "CTRL")]
 
@@ -39,8 +41,13 @@ class BodyState:
     angular: np.ndarray
     quat: np.ndarray
 
-    def rows(self, ids: np.ndarray) -> "BodyState":
-        """The state of rows ids only."""
+    @property
+    def moving(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What every body has: pos, mat, linear, angular."""
+        return self.pos, self.mat, self.linear, self.angular
+
+    def rows(self, ids: Rows) -> "BodyState":
+        """The state of rows ids only; of a slice of them without a copy."""
         return BodyState(
             pos=self.pos[ids],
             mat=self.mat[ids],
@@ -72,6 +79,9 @@ mj_kinematics, mj_com_pos, mj_com_vel = (
 )
 
 
+Look = Callable[[slice, BodyState], None]
+
+
 class BatchSim:
     """`rows` simulations of one model on `threads` threads (0: all cores).
 
@@ -87,14 +97,16 @@ class BatchSim:
         self._blow_ups = self._counted()
         self._data = [mujoco.MjData(model) for _ in range(self._batch.nthread)]
         self._pool = ThreadPoolExecutor(self._batch.nthread)
-        self._now = self._evaluated(np.arange(rows))
+        self._now = self._blank(rows)
+        self._evaluate(np.arange(rows), self._now)
 
     def set_state(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Put rows ids (n,) into poses qpos (n, nq) and velocities qvel (n, nv) and refresh their body states."""
         self._batch.state[ids] = self._rest  # what reset does, without a second call to the threads
         self.qpos[ids], self.qvel[ids] = qpos, qvel
-        self._now = BodyState(**{name: values.copy() for name, values in vars(self._now).items()})
-        self._now.assign_(ids, self._evaluated(np.asarray(ids)))
+        fresh = self._blank(len(ids))
+        self._evaluate(np.asarray(ids), fresh)
+        self._now.assign_(ids, fresh)
 
     def add_velocity(self, ids: np.ndarray, delta: np.ndarray) -> None:
         """Push rows ids: add delta (n, 3) m/s to the root's linear velocity. Body states follow at the next step."""
@@ -104,50 +116,56 @@ class BatchSim:
         """Sliding friction (N,) of the floor, geom 0, in each row."""
         self._batch.expand("geom_friction")[:, 0, 0] = floor
 
-    def step(self, ctrl: np.ndarray, substeps: int) -> np.ndarray:
-        """Advance all rows by `substeps` physics steps under ctrl (N, nu); returns ids (k,) of the failed rows."""
+    def step(self, ctrl: np.ndarray, substeps: int, look: Look | None = None) -> np.ndarray:
+        """Advance all rows by `substeps` physics steps under ctrl (N, nu); returns ids (k,) of the failed rows.
+
+        look(rows, body) is called by every thread with its run of the rows and their body states, while they are in
+        its cache.
+        """
         self._ctrl[:] = ctrl
         raised = np.empty(0, dtype=int)
         try:
             self._batch.step(nstep=substeps)
         except SimulationError as error:
             raised = np.asarray(error.ids)
-        self._now = self._evaluated(np.arange(self.rows))
+        self._now = self._blank(self.rows)
+        self._evaluate(np.arange(self.rows), self._now, look)
         before, self._blow_ups = self._blow_ups, self._counted()
         return np.union1d(raised, np.flatnonzero(self._blow_ups > before))
 
     def _counted(self) -> np.ndarray:
         return self._batch.warning[:, BLOW_UPS, 1].sum(1)  # (N, warning, [last info, count])
 
-    def state(self, ids: np.ndarray | None = None) -> BodyState:
-        """Fresh body states of all rows, or of rows ids; not to be written to."""
-        return self._now if ids is None else self._now.rows(ids)
+    def state(self, ids: Rows = ALL) -> BodyState:
+        """Body states of all rows, until they are set or stepped, or a copy of those of ids; not to be written to."""
+        return self._now.rows(ids)
 
-    def _evaluated(self, rows: np.ndarray) -> BodyState:
-        shape = len(rows), self.model.nbody - 1
-        body = BodyState(
+    def _blank(self, rows: int) -> BodyState:
+        shape = rows, self.model.nbody - 1
+        return BodyState(
             pos=np.empty((*shape, 3), np.float32),
             mat=np.empty((*shape, 3, 3), np.float32),
             linear=np.empty((*shape, 3), np.float32),
             angular=np.empty((*shape, 3), np.float32),
-            quat=np.empty((len(rows), 4), np.float32),
+            quat=np.empty((rows, 4), np.float32),
         )
 
-        def evaluate(data: mujoco.MjData, part: slice) -> None:
+    def _evaluate(self, ids: np.ndarray, body: BodyState, look: Look | None = None) -> None:
+        """Write the body states of rows ids (n,) to body, in parts side by side, each with an MjData of its own."""
+        parts = min(len(self._data), len(ids) // FEW + 1)
+        edges = [len(ids) * part // parts for part in range(parts + 1)]
+
+        def work(part: int) -> None:
+            data, rows = self._data[part], slice(edges[part], edges[part + 1])
             own = data.qpos, data.qvel, data.xpos, data.xmat, data.cvel, data.subtree_com
-            out = (values[part] for values in (body.pos, body.mat, body.linear, body.angular, body.quat))
-            _evaluate(self.model._address, data._address, *own, self.qpos, self.qvel, rows[part], *out)
+            some = body.rows(rows)
+            out = some.pos, some.mat, some.linear, some.angular, some.quat
+            _evaluate(self.model._address, data._address, *own, self.qpos, self.qvel, ids[rows], *out)
+            if look:
+                look(rows, some)
 
-        self._divided(evaluate, len(rows))
-        return body
-
-    def _divided(self, work: Callable[[mujoco.MjData, slice], None], rows: int) -> None:
-        """work for parts of the rows side by side, each with an MjData of its own."""
-        parts = min(len(self._data), rows // FEW + 1)
-        edges = [rows * part // parts for part in range(parts + 1)]
-        jobs = [(self._data[part], slice(edges[part], edges[part + 1])) for part in range(parts)]
-        others = [self._pool.submit(work, *job) for job in jobs[1:]]
-        work(*jobs[0])
+        others = [self._pool.submit(work, part) for part in range(1, parts)]
+        work(0)
         for other in others:
             other.result()
 

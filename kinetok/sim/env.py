@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from kinetok.motion.character import Character
-from kinetok.sim.batch import BatchSim, BodyState
+from kinetok.sim.batch import ALL, BatchSim, BodyState, Rows
 from kinetok.sim.reset import perturb
 from kinetok.sim.scene import SceneConfig, build_scene
 
@@ -53,7 +53,11 @@ class Step:
 
 
 class Task(Protocol):
-    """One file in sim/tasks: what to start from, what to see, what to reward, when it is over."""
+    """One file in sim/tasks: what to start from, what to see, what to reward, when it is over.
+
+    A step of Env calls advance, then observe for runs of the rows side by side, in threads, then reward and over; so
+    observe depends on neither of the last two and changes nothing but out.
+    """
 
     character: Character
     obs_size: int
@@ -61,7 +65,7 @@ class Task(Protocol):
     def start(self, ids: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]: ...
     def spread(self) -> None: ...
     def advance(self) -> None: ...
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray: ...
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray: ...
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]: ...
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]: ...
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None: ...
@@ -105,9 +109,14 @@ class Env:
 
     def step(self, action: np.ndarray) -> Step:
         """One control step for every row under PD targets (N, nu)."""
-        failed = self.sim.step(action, self.config.scene.substeps)
         self.task.advance()
         self.age += 1
+        obs = np.empty((self.rows, self.obs_size), dtype=np.float32)
+
+        def look(rows: slice, body: BodyState) -> None:
+            self.task.observe(body, rows, obs[rows])
+
+        failed = self.sim.step(action, self.config.scene.substeps, look)
         body = self.sim.state()
         reward, terms = self.task.reward(body)
         terminated, truncated = self.task.over(body)
@@ -117,7 +126,6 @@ class Env:
             reward = np.where(np.isfinite(reward), reward, 0.0)
         truncated = (truncated | (self.age >= self.limit)) & ~terminated
         self._returns += reward
-        obs = self.task.observe(body)
         done = np.flatnonzero(terminated | truncated)
         final = obs[done]
         if len(failed):

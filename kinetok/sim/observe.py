@@ -73,18 +73,19 @@ def window_features(
 def error_features(
     body: BodyState,
     reference: BodyState,
+    due: np.ndarray | None = None,
     beyond: np.ndarray | None = None,
     out: np.ndarray | None = None,
     start: int = 0,
 ) -> np.ndarray:
     """Tracking error now (N, error_size): position, rotation (sine of the angle times its axis) and velocities.
 
-    beyond (N, 2): metres of the floor by which the reference is shown nearer.
+    due (N,): the rows of `reference` in which the body's should be; its own, where not given. beyond (N, 2): metres of
+    the floor by which the reference is shown nearer.
     """
     out = _room(body, error_size(body.pos.shape[1])) if out is None else out
-    now = body.pos, body.mat, body.linear, body.angular
-    due = reference.pos, reference.mat, reference.linear, reference.angular
-    _error(*now, body.quat, *due, _or_none(beyond, body), out, start)
+    due = np.arange(len(body.pos)) if due is None else due
+    _error(*body.moving, body.quat, *reference.moving, due, _or_none(beyond, body), out, start)
     return out
 
 
@@ -147,27 +148,26 @@ def _window(pos, quat, pose, root, facing, ahead, beyond, out, start):
 
 
 @kernel
-def _error(pos, mat, linear, angular, quat, pos_due, mat_due, linear_due, angular_due, beyond, out, start):
+def _error(pos, mat, linear, angular, quat, pos_due, mat_due, linear_due, angular_due, due, beyond, out, start):
     # numbers of the arrays' own type, see kernels.py
     none, half, tenth, one = np.float32(0), np.float32(0.5), np.float32(0.1), np.float32(1)
     for row in range(len(pos)):
         cos, sin = turn_back(quat[row, 0], quat[row, 3])
-        x, y = beyond[row, 0], beyond[row, 1]
-        column = _put_differences(pos, pos_due, x, y, one, row, cos, sin, out, start)
+        x, y, at = beyond[row, 0], beyond[row, 1], due[row]
+        column = _put_differences(pos[row], pos_due[at], x, y, one, cos, sin, out, row, start)
         for b in range(pos.shape[1]):
-            now, due = mat[row, b], mat_due[row, b]
-            x, y, z = _skew(now, due, 1, 2), _skew(now, due, 2, 0), _skew(now, due, 0, 1)
+            now, then = mat[row, b], mat_due[at, b]
+            x, y, z = _skew(now, then, 1, 2), _skew(now, then, 2, 0), _skew(now, then, 0, 1)
             column = put_turned(half * x, half * y, half * z, cos, sin, out, row, column)
-        column = _put_differences(linear, linear_due, none, none, tenth, row, cos, sin, out, column)
-        _put_differences(angular, angular_due, none, none, tenth, row, cos, sin, out, column)
+        column = _put_differences(linear[row], linear_due[at], none, none, tenth, cos, sin, out, row, column)
+        _put_differences(angular[row], angular_due[at], none, none, tenth, cos, sin, out, row, column)
 
 
 @kernel
-def _put_differences(now, due, less_x, less_y, scale, row, cos, sin, out, column):
-    """What a row's vectors are short of those due, which are shown nearer by so many metres."""
-    for b in range(now.shape[1]):
-        x, y = due[row, b, 0] - less_x - now[row, b, 0], due[row, b, 1] - less_y - now[row, b, 1]
-        z = due[row, b, 2] - now[row, b, 2]
+def _put_differences(now, due, less_x, less_y, scale, cos, sin, out, row, column):
+    """What vectors (B, 3) are short of those due, which are shown nearer by so many metres."""
+    for b in range(len(now)):
+        x, y, z = due[b, 0] - less_x - now[b, 0], due[b, 1] - less_y - now[b, 1], due[b, 2] - now[b, 2]
         column = put_turned(scale * x, scale * y, scale * z, cos, sin, out, row, column)
     return column
 

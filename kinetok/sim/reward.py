@@ -25,37 +25,40 @@ class TrackingReward:
 ERRORS = ("position", "rotation", "linear", "angular", "height")
 
 
-def tracking_errors(body: BodyState, reference: BodyState) -> dict[str, np.ndarray]:
-    """Mean square errors (N,) by term. The squared angle is 3 - tr(R^T R_ref), equal to second order."""
+def tracking_errors(body: BodyState, reference: BodyState, due: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Mean square errors (N,) by term. The squared angle is 3 - tr(R^T R_ref), equal to second order.
+
+    due (N,): the rows of `reference` in which the body's should be; its own, where not given.
+    """
     out = np.empty((len(ERRORS), len(body.pos)), dtype=np.float32)
-    now = body.pos, body.mat, body.linear, body.angular
-    _errors(*now, reference.pos, reference.mat, reference.linear, reference.angular, out)
+    due = np.arange(len(body.pos)) if due is None else due
+    _errors(*body.moving, *reference.moving, due, out)
     return dict(zip(ERRORS, out, strict=True))
 
 
 @kernel
-def _errors(pos, mat, linear, angular, pos_due, mat_due, linear_due, angular_due, out):
+def _errors(pos, mat, linear, angular, pos_due, mat_due, linear_due, angular_due, due, out):
     bodies = pos.shape[1]
     for row in range(len(pos)):
-        alike = mat[row, 0, 0, 0] * 0
+        at, alike = due[row], mat[row, 0, 0, 0] * 0
         for b in range(bodies):
             for i in range(3):
                 for j in range(3):
-                    alike += mat[row, b, i, j] * mat_due[row, b, i, j]
-        out[0, row] = _squares(pos, pos_due, row) / bodies
+                    alike += mat[row, b, i, j] * mat_due[at, b, i, j]
+        out[0, row] = _squares(pos[row], pos_due[at]) / bodies
         out[1, row] = 3 - alike / bodies
-        out[2, row] = _squares(linear, linear_due, row) / bodies
-        out[3, row] = _squares(angular, angular_due, row) / bodies
-        out[4, row] = (pos[row, 0, 2] - pos_due[row, 0, 2]) ** 2
+        out[2, row] = _squares(linear[row], linear_due[at]) / bodies
+        out[3, row] = _squares(angular[row], angular_due[at]) / bodies
+        out[4, row] = (pos[row, 0, 2] - pos_due[at, 0, 2]) ** 2
 
 
 @kernel
-def _squares(now, due, row):
-    """The sum of the squared differences of a row's vectors."""
-    total = now[row, 0, 0] * 0
-    for b in range(now.shape[1]):
+def _squares(now, due):
+    """The sum of the squared differences of vectors (B, 3)."""
+    total = now[0, 0] * 0
+    for b in range(len(now)):
         for i in range(3):
-            total += (now[row, b, i] - due[row, b, i]) ** 2
+            total += (now[b, i] - due[b, i]) ** 2
     return total
 
 

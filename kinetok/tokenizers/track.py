@@ -138,7 +138,7 @@ def track(
             local[counts] += np.minimum(apart.mean(1), 1.0)
             frames[counts] += 1
             failed[counts] = step.terminated[counts] | (error.mean(1) > THRESHOLD)
-            height = np.abs(env.sim.qpos[:, 2] - task.reference.pos[:, 0, 2])
+            height = np.abs(env.sim.qpos[:, 2] - task.table.root[task.frame, 2])
             fallen |= running & (step.terminated | (height > FALL) if push else failed)
             running &= ~(fallen | step.truncated) & (steps < limit)
 

@@ -69,16 +69,20 @@ def test_rows_divided_among_threads_are_the_same_bits(scene):
     qpos, qvel = np.tile(scene.qpos0, (rows, 1)), rng.standard_normal((rows, scene.nv))
     qpos[:, 7:] += 0.3 * rng.standard_normal((rows, scene.nq - 7))
     one, two = BatchSim(scene, rows, 1), BatchSim(scene, rows, 2)
+    seen = []
     for sim in (one, two):
         sim.set_state(np.arange(rows), qpos, qvel)
-        sim.step(np.zeros((rows, scene.nu)), SUBSTEPS)
+        told = np.full((rows, scene.nbody - 1, 3), np.nan)
+        sim.step(np.zeros((rows, scene.nu)), SUBSTEPS, lambda part, body, told=told: np.copyto(told[part], body.pos))
+        np.testing.assert_array_equal(told, sim.state().pos)  # every row was looked at, fresh
+        seen.append(told)
+    np.testing.assert_array_equal(*seen)
     for name, values in vars(one.state()).items():
         np.testing.assert_array_equal(values, getattr(two.state(), name))
-    before = one.state()
-    kept = before.pos.copy()
+    some, other, now = one.state(np.array([3])), one.state().pos[4:].copy(), one.state()
     one.set_state(np.array([3]), qpos[:1], qvel[:1])
-    np.testing.assert_array_equal(before.pos, kept)  # what was read stays
-    assert not np.array_equal(one.state().pos[3], kept[3]) and np.array_equal(one.state().pos[4:], kept[4:])
+    assert not np.array_equal(now.pos[3], some.pos[0])  # all rows are seen as they are, some as they were
+    np.testing.assert_array_equal(now.pos[4:], other)
 
 
 @pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e12])

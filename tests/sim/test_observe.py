@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from kinetok import rotation
 from kinetok.sim import observe
 from kinetok.sim.batch import BodyState
+from kinetok.sim.reward import tracking_errors
 
 N, B, F = 6, 4, 3
 
@@ -101,7 +102,14 @@ def test_written_into_a_slice_of_an_observation():
     a, b = body(0), body(1)
     obs = np.full((N, 300), 7.0, dtype=np.float32)
     observe.state_features(a, obs, 3)
-    observe.error_features(a, b, None, obs, 100)
+    observe.error_features(a, b, out=obs, start=100)
     np.testing.assert_array_equal(obs[:, 3:61], observe.state_features(a)[:, :58])
     np.testing.assert_array_equal(obs[:, 100:148], observe.error_features(a, b))
     assert (obs[:, :3] == 7).all() and (obs[:, 61:100] == 7).all() and (obs[:, 148:] == 7).all()
+
+
+def test_what_is_due_may_be_any_rows_of_a_table():
+    a, table, due = body(0), body(1), np.arange(N)[::-1].copy()
+    np.testing.assert_array_equal(observe.error_features(a, table, due), observe.error_features(a, table.rows(due)))
+    for name, errors in tracking_errors(a, table, due).items():
+        np.testing.assert_array_equal(errors, tracking_errors(a, table.rows(due))[name])

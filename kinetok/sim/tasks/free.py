@@ -11,7 +11,7 @@ import numpy as np
 
 from kinetok.motion.character import Character
 from kinetok.sim import observe
-from kinetok.sim.batch import BodyState
+from kinetok.sim.batch import ALL, BodyState, Rows
 
 
 class Free:
@@ -52,9 +52,9 @@ class Free:
     def advance(self) -> None:
         """Nothing moves but the character."""
 
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray:
         """Proprioception (n, O) float32 of the rows in body."""
-        return observe.state_features(body)
+        return observe.state_features(body, out)
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Zeros (N,) and no terms."""

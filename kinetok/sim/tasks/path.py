@@ -17,7 +17,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
-from kinetok.sim.batch import BodyState
+from kinetok.sim.batch import ALL, BodyState, Rows
 from kinetok.sim.tasks.marker import AHEAD, GOAL, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
@@ -116,11 +116,10 @@ class Path:
                 self.points[due] += (way[:, None] * direction(self.world.rng.uniform(-np.pi, np.pi, len(due))))[:, None]
                 self._wait(due)
 
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray:
         """state | task (n, O) float32 of all rows or of rows ids."""
-        obs, task = self.world.blank(body)
-        points = self.points[:, self.now + self.arc :: self.arc][:, : self.config.waypoints]
-        points = points if ids is None else points[ids]
+        obs, task = self.world.blank(body, out)
+        points = self.points[ids, self.now + self.arc :: self.arc][:, : self.config.waypoints]
         task[:] = in_heading(points - body.pos[:, :1, :2], rotation.heading(body.quat)).reshape(task.shape)
         return obs
 

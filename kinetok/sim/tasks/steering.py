@@ -19,7 +19,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
-from kinetok.sim.batch import BodyState
+from kinetok.sim.batch import ALL, BodyState, Rows
 from kinetok.sim.tasks.marker import GOAL, SIDE, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
@@ -91,13 +91,12 @@ class Steering:
         if len(due):
             self._command(due)
 
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray:
         """state | task (n, O) float32 of all rows or of rows ids."""
-        obs, task = self.world.blank(body)
-        rows = slice(None) if ids is None else ids
-        velocity = self.speed[rows, None] * direction(self.angle[rows])
+        obs, task = self.world.blank(body, out)
+        velocity = self.speed[ids, None] * direction(self.angle[ids])
         task[:, :2] = in_heading(velocity, rotation.heading(body.quat))
-        task[:, 2:] = in_heading(direction(self.facing[rows]), rotation.heading(body.quat))
+        task[:, 2:] = in_heading(direction(self.facing[ids]), rotation.heading(body.quat))
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -17,7 +17,7 @@ import numpy as np
 from kinetok import rotation
 from kinetok.config import ConfigError
 from kinetok.motion.character import Character
-from kinetok.sim.batch import BodyState
+from kinetok.sim.batch import ALL, BodyState, Rows
 from kinetok.sim.tasks.marker import DONE, GOAL, Marker
 from kinetok.sim.tasks.upright import Upright, check_ranges, direction, in_heading, later, length
 
@@ -101,11 +101,10 @@ class Target:
             self._final[due] = length(self.target[due] - self.world.root[due, :2])
             self._place(due)
 
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray:
         """state | task (n, O) float32 of all rows or of rows ids."""
-        obs, task = self.world.blank(body)
-        target = self.target if ids is None else self.target[ids]
-        task[:] = _seen(in_heading(target - body.pos[:, 0, :2], rotation.heading(body.quat)))
+        obs, task = self.world.blank(body, out)
+        task[:] = _seen(in_heading(self.target[ids] - body.pos[:, 0, :2], rotation.heading(body.quat)))
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -21,7 +21,7 @@ from kinetok.motion.clip import Clip
 from kinetok.motion.kinematics import Motion, kinematics
 from kinetok.motion.library import ClipLibrary
 from kinetok.sim import observe
-from kinetok.sim.batch import BodyState
+from kinetok.sim.batch import ALL, BodyState, Rows
 from kinetok.sim.kernels import kernel
 from kinetok.sim.reset import ClipWeights
 from kinetok.sim.reward import TrackingReward, tracking_errors, tracking_reward
@@ -158,7 +158,6 @@ class Tracking:
         self.fixed, self.starts = fixed, starts
         self.clip = np.zeros(rows, dtype=int)
         self.frame = np.zeros(rows, dtype=int)
-        self.reference = table.body.rows(self.frame)  # where each row should be now
         self.offset = np.zeros((rows, len(self.character.body_names), 3), dtype=np.float32)
         self._future = np.array(config.future)
         bodies = len(self.character.body_names)
@@ -194,34 +193,29 @@ class Tracking:
     def place(self, ids: np.ndarray, clip: np.ndarray, frame: np.ndarray) -> None:
         """Let rows ids follow `clip` (n,) from table frame `frame` (n,) on."""
         self.clip[ids], self.frame[ids] = clip, frame
-        self.reference.assign_(ids, self.table.body.rows(frame))
 
     def advance(self) -> None:
         """Time goes on by one control step."""
         self.frame = np.minimum(self.frame + 1, self.table.last[self.clip])
-        self.reference = self.table.body.rows(self.frame)
         self.weights.count(self.clip)
 
-    def observe(self, body: BodyState, ids: np.ndarray | None = None) -> np.ndarray:
-        """state | window | error | target (n, O) float32 of all rows or of rows ids."""
-        table = self.table
-        frame, last, reference = self.frame, table.last[self.clip], self.reference
-        if ids is not None:
-            frame, last, reference = frame[ids], last[ids], reference.rows(ids)
-        ahead = np.minimum(frame[:, None] + self._future, last[:, None])
-        away = reference.pos[:, 0, :2] - body.pos[:, 0, :2]
-        beyond = away - _no_longer(away, self.config.leash)
-        obs = np.empty((len(frame), self.obs_size), dtype=np.float32)
+    def observe(self, body: BodyState, ids: Rows = ALL, out: np.ndarray | None = None) -> np.ndarray:
+        """state | window | error | target (n, O) float32 of rows ids, which are in states body; to out, if given."""
+        table, frame = self.table, self.frame[ids]
+        last = table.last[self.clip[ids]]
+        ahead, beyond = np.empty((len(frame), len(self._future)), int), np.empty((len(frame), 2), np.float32)
+        _shown(table.root, body.pos, frame, last, self._future, np.float32(self.config.leash), ahead, beyond)
+        obs = np.empty((len(frame), self.obs_size), dtype=np.float32) if out is None else out
         start = {name: columns.start for name, columns in self.layout.items()}
         observe.state_features(body, obs, start["state"])
         observe.window_features(body, table.pose, table.root, table.facing, ahead, beyond, obs, start["window"])
-        observe.error_features(body, reference, beyond, obs, start["error"])
+        observe.error_features(body, table.body, frame, beyond, obs, start["error"])
         obs[:, self.layout["target"]] = table.target[np.minimum(frame + 1, last)]
         return obs
 
     def reward(self, body: BodyState) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """GPC eq. 8 against the frame the row should have reached."""
-        terms = tracking_reward(tracking_errors(body, self.reference), self.config.reward)
+        terms = tracking_reward(tracking_errors(body, self.table.body, self.frame), self.config.reward)
         return np.sum(list(terms.values()), axis=0), terms
 
     def over(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +223,7 @@ class Tracking:
 
         `offset` keeps where the reference was from every body (N, B, 3), in metres, before any reset.
         """
-        offset = self.offset = self.reference.pos - body.pos
+        offset = self.offset = self.table.body.pos[self.frame] - body.pos
         if self.config.failure.slack:
             offset = offset.copy()
             offset[..., :2] -= _no_longer(offset[:, :1, :2], self.config.failure.slack)
@@ -247,6 +241,18 @@ class Tracking:
     def finished(self, ids: np.ndarray, terminated: np.ndarray) -> None:
         """Failure-weighted clip sampling learns from every finished episode."""
         self.weights.update(self.clip[ids], ~terminated)
+
+
+@kernel
+def _shown(root, pos, frame, last, future, leash, ahead, beyond):
+    """The frames ahead of each row, and by how much it is shown them nearer than they are, see TrackingConfig."""
+    for row in range(len(frame)):
+        for k in range(len(future)):
+            ahead[row, k] = min(frame[row] + future[k], last[row])
+        x, y = root[frame[row], 0] - pos[row, 0, 0], root[frame[row], 1] - pos[row, 0, 1]
+        length = np.sqrt(x * x + y * y)
+        share = (length - leash) / length if length > leash else length * 0
+        beyond[row, 0], beyond[row, 1] = share * x, share * y
 
 
 @kernel

@@ -58,9 +58,9 @@ class Upright:
         self.root[ids] = qpos[:, :3]
         return qpos, qvel
 
-    def blank(self, body: BodyState) -> tuple[np.ndarray, np.ndarray]:
+    def blank(self, body: BodyState, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Observations (n, O) float32 with the state filled in, and the task's columns of them, yet to be filled."""
-        obs = np.empty((len(body.pos), self.obs_size), dtype=np.float32)
+        obs = np.empty((len(body.pos), self.obs_size), dtype=np.float32) if out is None else out
         observe.state_features(body, obs, self.layout["state"].start)
         return obs, obs[:, self.layout["task"]]
 
