@@ -101,17 +101,19 @@ class Training:
         save_every: int = 0,
         critic_warmup: int = 0,
         warm: bool = False,
+        latest: bool = False,
         title: str = "ppo",
         prefix: str = "eval",
         quiet: bool = False,
     ) -> Progress:
         """Train until `samples` control steps are done or `finished` says so.
 
-        keep: writes the artifact, called with each score that is the best so far. schedule: told the share done
-        before each rollout. save_every: samples from a save to the evaluation that is followed by the next, 0 for every
-        one; after a save the worlds begin anew, so not too often. critic_warmup: first iterations that leave the policy
-        alone. warm: the policy's normalisers come from an earlier training and stay as they are: moved, they undo what
-        its weights, which know no others, can do (docs/log.md, "What a normaliser forgets").
+        keep: writes the artifact, called with each score that is the best so far, or with every one when only the
+        `latest` is to stay. schedule: told the share done before each rollout. save_every: samples from a save to the
+        evaluation that is followed by the next, 0 for every one; after a save the worlds begin anew, so not too often.
+        critic_warmup: first iterations that leave the policy alone. warm: the policy's normalisers come from an
+        earlier training and stay as they are: moved, they undo what its weights, which know no others, can do
+        (docs/log.md, "What a normaliser forgets").
         """
         progress = self.resume()
         per_iteration = self.world.rows * self.config.horizon * ranks.size()
@@ -143,8 +145,10 @@ class Training:
                     with self.average.standing_in() if self.average else nullcontext():
                         score = ranks.first(evaluate)
                         progress.stale += 1
-                        if score.merit > progress.best:
-                            progress.best, progress.stale, progress.score = score.merit, 0, score.to_json()
+                        if better := score.merit > progress.best:
+                            progress.best, progress.stale = score.merit, 0
+                        if better or latest:
+                            progress.score = score.to_json()
                             ranks.first(partial(keep, score))
                     metrics |= {f"{prefix}/{name}": value for name, value in score.summary().items()}
                 metrics["reward"] = float(rollout.rewards.mean())  # a step; episodes' sums are of whole episodes alone

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -39,7 +40,8 @@ from kinetok.tokenizers.train import COUNTS, KINDS, identify, in_scene, refuse_o
 class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; ema: factor of the average of the student's weights over control steps, which is then
-    what is judged and kept (rl/average.py), 0 for the last ones themselves; noise: radians added to the student's
+    what is judged and kept (rl/average.py), 0 for the last ones themselves; keep: the artifact of the best evaluation
+    or of the last; noise: radians added to the student's
     targets while it acts; failure: when its episodes end; focus: how many times as many states the clip that fails most
     may have as the one that fails least; from_start: share of the episodes that begin at their clip's first frame;
     transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
@@ -58,6 +60,7 @@ class DistillStage:
     lr: float = 1e-3
     lr_end: float = 1e-4
     ema: float = 0.0
+    keep: Literal["best", "last"] = "best"
     noise: float = 0.02
     failure: Failure = Failure()
     focus: float = 4.0
@@ -174,7 +177,7 @@ def distill(
                 evaluated = samples
                 with average.standing_in() if average else nullcontext():
                     score = judge()
-                    if best is None or score.merit > best.merit:
+                    if best is None or score.merit > best.merit or config.keep == "last":
                         best = score
                         student.save_pretrained(out, card(score), parents)
                 metrics |= {f"track/{k}": v for k, v in score.summary().items()} | env.episode_metrics()

@@ -13,6 +13,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -47,7 +48,9 @@ class PPOStage:
     stop_success reached, the best score is so many evaluations old; critic_warmup: first iterations that leave the
     policy alone; log_std: spread of the actions at the first and the last iteration; anchor: pull towards the policy
     it started from; ema: factor of the average of the weights over updates, which is then what is judged and kept
-    (rl/average.py), 0 for the last ones themselves; failure: when training's episodes end, leniency: its limits at the
+    (rl/average.py), 0 for the last ones themselves; keep: the artifact of the evaluation that was best, success first,
+    or of the last: with less and less noise that is the nearest, and an episode in fifty lost again outweighs ten
+    millimetres only for the best; failure: when training's episodes end, leniency: its limits at the
     first iteration, as a multiple of those, which they come down to evenly; eval_push: evaluations
     push the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
     clip, within `reach` metres of roaming.likeness, so that motions can go over into one another; from_start: share of
@@ -65,6 +68,7 @@ class PPOStage:
     log_std: tuple[float, float] = (-2.6, -2.9)
     anchor: float = 0.0
     ema: float = 0.0
+    keep: Literal["best", "last"] = "best"
     failure: Failure = Failure()
     leniency: float = 1.0
     eval_push: float = 0.0
@@ -148,6 +152,7 @@ def train_ppo(
         eval_every=config.eval_every,
         evaluate=evaluate,
         keep=lambda score: actor.save_pretrained(out, card(score), parents),
+        latest=config.keep == "last",
         finished=lambda progress: good_enough(progress, config),
         schedule=settle,
         critic_warmup=config.critic_warmup,

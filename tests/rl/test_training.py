@@ -117,6 +117,13 @@ def test_only_a_better_score_is_kept(tmp_path):
     assert state(tmp_path)[1]["progress"] == vars(progress)
 
 
+def test_or_every_one_and_the_last_stays(tmp_path):
+    run = Run(tmp_path)
+    progress = run.train(merits=[3.0, 4.0, 1.0, 2.0], latest=True)
+    assert [merit for merit, _ in run.kept] == [3.0, 4.0, 1.0, 2.0]
+    assert progress.best == 4.0 and progress.stale == 2 and progress.score == {"merit": 2.0}
+
+
 @pytest.mark.parametrize("stop_at", [256, 384])
 def test_a_resumed_run_is_the_unbroken_one(tmp_path, stop_at):
     Run(tmp_path / "whole").train(merits=[1.0, 2.0, 3.0, 0.0])

@@ -107,6 +107,13 @@ def test_an_average_of_the_weights_is_judged_and_resumed(
     assert load_artifact(tmp_path / "cut").hash == load_artifact(tmp_path / "whole").hash
 
 
+def test_it_may_leave_the_last(config, student, teachers, standing, tmp_path):
+    distill(student, teachers, standing, replace(config, keep="last"), tmp_path, quiet=True)
+    tensors = load_state(tmp_path / "state.safetensors")[0]
+    last = {name.split("student.")[1]: value for name, value in tensors.items() if ".student." in name}
+    assert same(last, MotionTokenizer.from_pretrained(tmp_path).state_dict())
+
+
 def test_it_returns_the_kept_student_and_its_score(whole, config, student, teachers, standing, monkeypatch):
     out, score = whole
     kept = MotionTokenizer.from_pretrained(out)

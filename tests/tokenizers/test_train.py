@@ -80,6 +80,16 @@ def test_it_returns_the_best_not_the_last(whole, small, standing, config):
     assert again.to_json() == score.to_json()
 
 
+def test_it_may_leave_the_last(config, student, standing, tmp_path):
+    score = train_ppo(student, standing, replace(config, keep="last"), tmp_path, quiet=True)
+    assert same(MotionTokenizer.from_pretrained(tmp_path).state_dict(), student.state_dict())
+    line = [line for line in read_metrics(tmp_path / "metrics.jsonl") if "track/success" in line][-1]
+    assert line["track/mpjpe_mm"] == pytest.approx(score.mpjpe_mm.mean())
+    tensors = load_state(tmp_path / "state.safetensors")[0]
+    last = {name[11:]: value for name, value in tensors.items() if name.startswith("tree.actor.")}
+    assert same(last, student.state_dict())
+
+
 def test_a_resumed_run_is_the_unbroken_one(half, whole, config, small, standing):
     out, score = whole
     assert load_state(half / "state.safetensors")[1]["progress"]["samples"] == 512
