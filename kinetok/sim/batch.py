@@ -98,14 +98,14 @@ class BatchSim:
         self._data = [mujoco.MjData(model) for _ in range(self._batch.nthread)]
         self._pool = ThreadPoolExecutor(self._batch.nthread)
         self._now = self._blank(rows)
-        self._evaluate(np.arange(rows), self._now)
+        self._refresh(np.arange(rows), self._now)
 
     def set_state(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Put rows ids (n,) into poses qpos (n, nq) and velocities qvel (n, nv) and refresh their body states."""
         self._batch.state[ids] = self._rest  # what reset does, without a second call to the threads
         self.qpos[ids], self.qvel[ids] = qpos, qvel
         fresh = self._blank(len(ids))
-        self._evaluate(np.asarray(ids), fresh)
+        self._refresh(np.asarray(ids), fresh)
         self._now.assign_(ids, fresh)
 
     def add_velocity(self, ids: np.ndarray, delta: np.ndarray) -> None:
@@ -129,7 +129,7 @@ class BatchSim:
         except SimulationError as error:
             raised = np.asarray(error.ids)
         self._now = self._blank(self.rows)
-        self._evaluate(np.arange(self.rows), self._now, look)
+        self._refresh(np.arange(self.rows), self._now, look)
         before, self._blow_ups = self._blow_ups, self._counted()
         return np.union1d(raised, np.flatnonzero(self._blow_ups > before))
 
@@ -137,7 +137,8 @@ class BatchSim:
         return self._batch.warning[:, BLOW_UPS, 1].sum(1)  # (N, warning, [last info, count])
 
     def state(self, ids: Rows = ALL) -> BodyState:
-        """Body states of all rows, until they are set or stepped, or a copy of those of ids; not to be written to."""
+        """Body states of all rows or a run of them, as they are until the next step, or a copy of those of ids (n,);
+        not to be written to."""
         return self._now.rows(ids)
 
     def _blank(self, rows: int) -> BodyState:
@@ -150,7 +151,7 @@ class BatchSim:
             quat=np.empty((rows, 4), np.float32),
         )
 
-    def _evaluate(self, ids: np.ndarray, body: BodyState, look: Look | None = None) -> None:
+    def _refresh(self, ids: np.ndarray, body: BodyState, look: Look | None = None) -> None:
         """Write the body states of rows ids (n,) to body, in parts side by side, each with an MjData of its own."""
         parts = min(len(self._data), len(ids) // FEW + 1)
         edges = [len(ids) * part // parts for part in range(parts + 1)]

@@ -41,13 +41,12 @@ class DistillStage:
     """samples: control steps of the student; rows: worlds; updates: minibatches of `minibatch` per control step;
     memory: labelled states kept; ema: factor of the average of the student's weights over control steps, which is then
     what is judged and kept (rl/average.py), 0 for the last ones themselves; keep: the artifact of the best evaluation
-    or of the last; noise: radians added to the student's
-    targets while it acts; failure: when its episodes end; focus: how many times as many states the clip that fails most
-    may have as the one that fails least; from_start: share of the episodes that begin at their clip's first frame;
-    transitions: changes of clip per second while it learns (sim.tasks.roaming), labelled by the new clip's teacher;
-    reach_at_end: metres of roaming.likeness within which a motion goes on in another clip where its own ends;
-    save_every: samples between states to resume from, at the next evaluation (the memory starts anew there, so not too
-    often).
+    or of the last; noise: radians added to the student's targets while it acts; failure: when its episodes end; focus:
+    how many times as many states the clip that fails most may have as the one that fails least; from_start: share of
+    the episodes that begin at their clip's first frame; transitions: changes of clip per second while it learns
+    (sim.tasks.roaming), labelled by the new clip's teacher; reach_at_end: metres of roaming.likeness within which a
+    motion goes on in another clip where its own ends; save_every: samples between states to resume from, at the next
+    evaluation (the memory starts anew there, so not too often).
 
     A clip that its own teacher cannot follow fails for ever, and takes its share for nothing: of K clips, one such
     leaves (K - 1) / (K - 1 + focus) of the states to the others: of 20 clips 5/6 with a focus of 4."""

@@ -48,11 +48,10 @@ class PPOStage:
     stop_success reached, the best score is so many evaluations old; critic_warmup: first iterations that leave the
     policy alone; log_std: spread of the actions at the first and the last iteration; anchor: pull towards the policy
     it started from; ema: factor of the average of the weights over updates, which is then what is judged and kept
-    (rl/average.py), 0 for the last ones themselves; keep: the artifact of the evaluation that was best, success first,
-    or of the last: with less and less noise that is the nearest, and an episode in fifty lost again outweighs ten
-    millimetres only for the best; failure: when training's episodes end, leniency: its limits at the
-    first iteration, as a multiple of those, which they come down to evenly; eval_push: evaluations
-    push the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
+    (rl/average.py), 0 for the last ones themselves; keep: the artifact of the best evaluation, in which one episode
+    lost outweighs any millimetres, or of the last, to go on from; failure: when training's episodes end, leniency: its
+    limits at the first iteration, as a multiple of those, which they come down to evenly; eval_push: evaluations push
+    the root by so many m/s every two seconds; arrivals: share of the episodes that begin in a state of another
     clip, within `reach` metres of roaming.likeness, so that motions can go over into one another; from_start: share of
     the episodes that begin at their clip's first frame, in the place of anywhere in it."""
 
